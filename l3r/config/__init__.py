@@ -1,0 +1,28 @@
+"""Typed configuration in layers; imports no torch."""
+
+from l3r.config.data import DataConfig, SourceConfig
+from l3r.config.graph import GraphConfig
+from l3r.config.inference import InferenceConfig
+from l3r.config.layers import from_plain, load_config, to_plain, to_yaml
+from l3r.config.loss import LossConfig
+from l3r.config.model import AlignmentConfig, DecoderConfig, EncoderConfig, ModelConfig
+from l3r.config.run import RunConfig
+from l3r.config.train import TrainConfig
+
+__all__ = [
+    "AlignmentConfig",
+    "DataConfig",
+    "DecoderConfig",
+    "EncoderConfig",
+    "GraphConfig",
+    "InferenceConfig",
+    "LossConfig",
+    "ModelConfig",
+    "RunConfig",
+    "SourceConfig",
+    "TrainConfig",
+    "from_plain",
+    "load_config",
+    "to_plain",
+    "to_yaml",
+]

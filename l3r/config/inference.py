@@ -1,0 +1,40 @@
+"""How photos are reconstructed."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from l3r.config.check import require
+
+
+@dataclass(kw_only=True, slots=True)
+class InferenceConfig:
+    """Symmetrisation, point selection and camera fitting."""
+
+    chunk_size: int = 32
+    """Images encoded, and edges decoded, at once."""
+    symmetrize: Literal["child", "both", "off"] = "child"
+    """Decode each edge both ways and average; the fit uses the child's map, or both maps."""
+    min_conf: float = 3.0
+    """Points of a confidence above this go to PnP."""
+    fallback_share: float = 0.1
+    """Share of most confident points taken where fewer than ``min_points`` pass; 0: no fallback."""
+    min_points: int = 32
+    """Points PnP needs."""
+    pnp_points: int = 2000
+    """Points sampled for PnP."""
+    pnp_error: float = 0.01
+    """RANSAC's inlier threshold as a share of the photo's long side."""
+    pnp_iterations: int = 200
+    """RANSAC's rounds at most."""
+    seed: int = 0
+    """Seed of RANSAC and of the point sample."""
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        for key in ("chunk_size", "pnp_iterations"):
+            require(getattr(self, key) >= 1, f"inference.{key}", getattr(self, key), "1 or more")
+        for key in ("min_points", "pnp_points"):
+            require(getattr(self, key) >= 4, f"inference.{key}", getattr(self, key), "4 or more")
+        share = self.fallback_share
+        require(0 <= share <= 1, "inference.fallback_share", share, "0 to 1")
+        require(self.pnp_error > 0, "inference.pnp_error", self.pnp_error, "more than 0")

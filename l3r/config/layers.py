@@ -1,0 +1,96 @@
+"""Layers of YAML and ``key=value`` become one typed configuration."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, cast
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from l3r.config.run import RunConfig
+from l3r.errors import ConfigError
+
+
+def load_config(layers: Sequence[str]) -> RunConfig:
+    """Merge layers left to right; the later one wins.
+
+    Args:
+        layers: YAML files, and overrides of the form ``section.key=value``.
+
+    Raises:
+        ConfigError: A file cannot be read, a key is unknown, a value is out of range or missing.
+            The message names the layer, and the nearest known key.
+    """
+    config = OmegaConf.structured(RunConfig)
+    for layer in layers:
+        config = (
+            _merge_override(config, layer) if "=" in layer else _merge_file(config, Path(layer))
+        )
+    if missing := sorted(OmegaConf.missing_keys(config)):
+        raise ConfigError(f"no value for {', '.join(missing)}; give one as key=value")
+    return _to_object(config, "layers")
+
+
+def to_plain(config: RunConfig) -> dict[str, Any]:
+    """Turn a configuration into builtins only, so that a checkpoint holding it loads safely."""
+    return asdict(config)
+
+
+def from_plain(plain: Mapping[str, Any], where: str) -> RunConfig:
+    """Rebuild a configuration from what :func:`to_plain` gave.
+
+    Args:
+        plain: Nested builtins.
+        where: The file they come from, for the message.
+
+    Raises:
+        ConfigError: A key is unknown or a value out of range.
+    """
+    try:
+        config = OmegaConf.merge(OmegaConf.structured(RunConfig), dict(plain))
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"{where}: {_first_line(error)}") from error
+    return _to_object(cast(DictConfig, config), where)
+
+
+def to_yaml(config: RunConfig) -> str:
+    """Print a configuration as YAML, in the order of its declaration."""
+    return OmegaConf.to_yaml(OmegaConf.create(to_plain(config)))
+
+
+def _merge_file(config: DictConfig, path: Path) -> DictConfig:
+    if not path.is_file():
+        hint = "an override has the form section.key=value" if not path.suffix else "check the path"
+        raise ConfigError(f"layer {path}: no such file; {hint}")
+    try:
+        layer = OmegaConf.load(path)
+        if not isinstance(layer, DictConfig):
+            raise ConfigError(f"layer {path}: expected sections such as 'model:', found a list")
+        return cast(DictConfig, OmegaConf.merge(config, layer))
+    except (OmegaConfBaseException, YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"layer {path}: {_first_line(error)}") from error
+
+
+def _merge_override(config: DictConfig, override: str) -> DictConfig:
+    merged = config.copy()
+    try:
+        merged.merge_with_dotlist([override])
+    except (OmegaConfBaseException, YAMLError) as error:
+        raise ConfigError(f"override '{override}': {_first_line(error)}") from error
+    return merged
+
+
+def _to_object(config: DictConfig, where: str) -> RunConfig:
+    try:
+        return cast(RunConfig, OmegaConf.to_object(config))
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from error
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"{where}: {_first_line(error)}") from error
+
+
+def _first_line(error: Exception) -> str:
+    """Keep what a user needs of a library's many-line message."""
+    return " ".join(str(error).split(" full_key:")[0].split("\n")[0].split())

@@ -1,0 +1,28 @@
+"""The whole configuration of a run."""
+
+from dataclasses import dataclass, field
+
+from l3r.config.data import DataConfig
+from l3r.config.graph import GraphConfig
+from l3r.config.inference import InferenceConfig
+from l3r.config.loss import LossConfig
+from l3r.config.model import ModelConfig
+from l3r.config.train import TrainConfig
+
+
+@dataclass(kw_only=True, slots=True)
+class RunConfig:
+    """One section per room."""
+
+    model: ModelConfig = field(default_factory=ModelConfig)
+    """The network."""
+    graph: GraphConfig = field(default_factory=GraphConfig)
+    """Tree and accumulation."""
+    loss: LossConfig = field(default_factory=LossConfig)
+    """Training loss."""
+    data: DataConfig = field(default_factory=DataConfig)
+    """Sources and batches."""
+    train: TrainConfig = field(default_factory=TrainConfig)
+    """Optimisation."""
+    inference: InferenceConfig = field(default_factory=InferenceConfig)
+    """Reconstruction."""

@@ -1,0 +1,65 @@
+"""How it is trained."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from l3r.config.check import require
+
+
+@dataclass(kw_only=True, slots=True)
+class TrainConfig:
+    """Optimiser, schedule, checkpoints."""
+
+    output_dir: str = "runs/train"
+    """Where checkpoints, ``metrics.csv`` and ``config.yaml`` go; a run found there is resumed."""
+    seed: int = 0
+    """Seed of weights and of every sample drawn."""
+    max_steps: int = 100_000
+    """Optimisation steps."""
+    lr: float = 1e-6
+    """Learning rate at 64 images (8 graphs of 8) a step; scaled linearly with images a step."""
+    weight_decay: float = 5e-4
+    """Weight decay; none on 1-D parameters."""
+    betas: list[float] = field(default_factory=lambda: [0.9, 0.95])
+    """AdamW's moments."""
+    schedule: Literal["constant", "cosine"] = "constant"
+    """Learning rate after the warm-up."""
+    warmup_steps: int = 0
+    """Steps of linear warm-up."""
+    min_lr_ratio: float = 0.01
+    """What the cosine ends at, as a share of ``lr``."""
+    clip_norm: float | None = None
+    """Clip the gradient's norm; off by default."""
+    max_bad_steps: int = 3
+    """Stop after so many steps in a row with a loss or gradient that is not finite."""
+    checkpoint_every: int = 1000
+    """Steps between checkpoints."""
+    validate_every: int = 1000
+    """Steps between validations."""
+    validation_graphs: int = 32
+    """Graphs of each validation."""
+    log_every: int = 50
+    """Steps between rows of ``metrics.csv``."""
+    accelerator: str = "auto"
+    """``auto``, ``cpu`` or ``gpu``."""
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        for key in (
+            "max_steps",
+            "checkpoint_every",
+            "validate_every",
+            "log_every",
+            "max_bad_steps",
+        ):
+            require(getattr(self, key) >= 1, f"train.{key}", getattr(self, key), "1 or more")
+        for key in ("warmup_steps", "weight_decay", "validation_graphs", "min_lr_ratio"):
+            require(getattr(self, key) >= 0, f"train.{key}", getattr(self, key), "0 or more")
+        require(self.lr > 0, "train.lr", self.lr, "more than 0")
+        require(len(self.betas) == 2, "train.betas", self.betas, "two numbers")
+        require(
+            self.clip_norm is None or self.clip_norm > 0,
+            "train.clip_norm",
+            self.clip_norm,
+            "null or > 0",
+        )

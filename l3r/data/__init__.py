@@ -1,0 +1,1 @@
+"""The shard schema, stages and the step-indexed loader."""

@@ -1,0 +1,1 @@
+"""Similarity scores, trees over the views, accumulation along a tree."""

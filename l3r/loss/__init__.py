@@ -1,0 +1,1 @@
+"""Confidence, pairwise, global and joint loss."""

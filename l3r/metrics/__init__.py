@@ -1,0 +1,1 @@
+"""Pose accuracy: pure maths, no files."""
