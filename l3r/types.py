@@ -12,7 +12,7 @@ set, and images of different shapes stack by padding with points at zero of log-
 which carry no weight anywhere.
 """
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -48,12 +48,9 @@ class Views:
 
     def pin_memory(self) -> "Views":
         """Pin every tensor; torch's loader passes a plain dataclass through unpinned otherwise."""
-        pinned = {
-            f.name: value.pin_memory() if isinstance(value, Tensor) else value
-            for f in fields(self)
-            for value in [getattr(self, f.name)]
-        }
-        return Views(**pinned)
+        tensors = {f.name: getattr(self, f.name) for f in fields(self)}
+        pinned = {k: v.pin_memory() for k, v in tensors.items() if isinstance(v, Tensor)}
+        return replace(self, **pinned)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -60,26 +60,26 @@ def to_yaml(config: RunConfig) -> str:
     return OmegaConf.to_yaml(OmegaConf.create(to_plain(config)))
 
 
-def _merge_file(config: DictConfig, path: Path) -> DictConfig:
+def _merge_file(config: DictConfig, layer: str) -> DictConfig:
+    path = Path(layer)
     if not path.is_file():
         hint = "an override has the form section.key=value" if not path.suffix else "check the path"
         raise ConfigError(f"layer {path}: no such file; {hint}")
     try:
-        layer = OmegaConf.load(path)
-        if not isinstance(layer, DictConfig):
+        loaded = OmegaConf.load(path)
+        if not isinstance(loaded, DictConfig):
             raise ConfigError(f"layer {path}: expected sections such as 'model:', found a list")
-        return cast(DictConfig, OmegaConf.merge(config, layer))
+        return cast(DictConfig, OmegaConf.merge(config, loaded))
     except (OmegaConfBaseException, YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"layer {path}: {_first_line(error)}") from error
 
 
 def _merge_override(config: DictConfig, override: str) -> DictConfig:
-    merged = config.copy()
     try:
-        merged.merge_with_dotlist([override])
+        # A merge, not merge_with_dotlist: only this can add a data source that no file named.
+        return cast(DictConfig, OmegaConf.merge(config, OmegaConf.from_dotlist([override])))
     except (OmegaConfBaseException, YAMLError) as error:
         raise ConfigError(f"override '{override}': {_first_line(error)}") from error
-    return merged
 
 
 def _to_object(config: DictConfig, where: str) -> RunConfig:

@@ -57,9 +57,5 @@ class TrainConfig:
             require(getattr(self, key) >= 0, f"train.{key}", getattr(self, key), "0 or more")
         require(self.lr > 0, "train.lr", self.lr, "more than 0")
         require(len(self.betas) == 2, "train.betas", self.betas, "two numbers")
-        require(
-            self.clip_norm is None or self.clip_norm > 0,
-            "train.clip_norm",
-            self.clip_norm,
-            "null or > 0",
-        )
+        clip = self.clip_norm
+        require(clip is None or clip > 0, "train.clip_norm", clip, "null or more than 0")
