@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 __all__ = ["__version__", "load_model", "reconstruct"]
 
 
-def __getattr__(name: str) -> Any:  # noqa: ANN401
+def __getattr__(name: str) -> Any:
     """Import the public functions on first use."""
     if name == "load_model":
         from l3r.inference.checkpoint import load_model

@@ -13,6 +13,7 @@ which carry no weight anywhere.
 """
 
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -48,8 +49,11 @@ class Views:
 
     def pin_memory(self) -> "Views":
         """Pin every tensor; torch's loader passes a plain dataclass through unpinned otherwise."""
-        tensors = {f.name: getattr(self, f.name) for f in fields(self)}
-        pinned = {k: v.pin_memory() for k, v in tensors.items() if isinstance(v, Tensor)}
+        pinned: dict[str, Any] = {
+            f.name: value.pin_memory()
+            for f in fields(self)
+            if isinstance(value := getattr(self, f.name), Tensor)
+        }
         return replace(self, **pinned)
 
 

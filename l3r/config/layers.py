@@ -25,9 +25,7 @@ def load_config(layers: Sequence[str]) -> RunConfig:
     """
     config = OmegaConf.structured(RunConfig)
     for layer in layers:
-        config = (
-            _merge_override(config, layer) if "=" in layer else _merge_file(config, Path(layer))
-        )
+        config = _merge_override(config, layer) if "=" in layer else _merge_file(config, layer)
     if missing := sorted(OmegaConf.missing_keys(config)):
         raise ConfigError(f"no value for {', '.join(missing)}; give one as key=value")
     return _to_object(config, "layers")

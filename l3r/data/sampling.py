@@ -1,0 +1,47 @@
+"""Which graph stands in which slot of which step: a pure function, hence exact resume."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+
+DRAW_SOURCE, SHUFFLE = 1, 2  # streams of randomness that must not meet
+
+
+class SampleChooser:
+    """Choose a source and a graph for each global slot of each step.
+
+    The choice depends on (seed, step, global slot) and on nothing else: another number of devices
+    or workers sees the same samples, and no state must be kept but the step. Each source runs
+    through a permutation of its graphs before any comes again.
+
+    Args:
+        sizes: Graphs of each source.
+        weights: Relative frequency of each source.
+        slots_per_step: Graphs of one step over all devices.
+        seed: Seed of all choices.
+    """
+
+    def __init__(
+        self, sizes: Sequence[int], weights: Sequence[float], slots_per_step: int, seed: int
+    ) -> None:
+        self.sizes = tuple(sizes)
+        self.share = np.cumsum(np.asarray(weights, dtype=float) / np.sum(weights))
+        self.slots_per_step = slots_per_step
+        self.seed = seed
+
+    def choose(self, step: int, slot: int) -> tuple[int, int]:
+        """Return (source, graph within it) for one slot of one step."""
+        source = 0
+        if len(self.sizes) > 1:
+            draw = np.random.default_rng((self.seed, DRAW_SOURCE, step, slot)).random()
+            source = min(int(np.searchsorted(self.share, draw, side="right")), len(self.sizes) - 1)
+        # Counted over the slots of all sources: a source uses part of each of its permutations.
+        epoch, position = divmod(step * self.slots_per_step + slot, self.sizes[source])
+        order = _permutation(self.seed, source, epoch, self.sizes[source])
+        return source, int(order[position])
+
+
+@lru_cache(maxsize=32)
+def _permutation(seed: int, source: int, epoch: int, size: int) -> np.ndarray:
+    return np.random.default_rng((seed, SHUFFLE, source, epoch)).permutation(size)

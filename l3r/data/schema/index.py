@@ -1,0 +1,169 @@
+"""Where in a tar each graph lies, so that a sample is one read."""
+
+import io
+import json
+import re
+import tarfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from l3r.data.schema.graph import SCHEMA_VERSION
+from l3r.errors import DataError
+from l3r.files import write_atomic
+
+_BLOCK = 512
+_IMAGE = re.compile(r"\d\d\.jpg")
+
+
+@dataclass(frozen=True, kw_only=True)
+class IndexEntry:
+    """One graph: a contiguous range of whole tar records."""
+
+    key: str
+    """Name of the graph."""
+    offset: int
+    """First byte of its first header."""
+    size: int
+    """Bytes up to the end of its last record, padding included."""
+    num_views: int
+    """Images it holds."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShardIndex:
+    """All graphs of one tar, in order."""
+
+    tar_bytes: int
+    """Size of the tar it was made of."""
+    graphs: list[IndexEntry]
+    """One entry per graph."""
+
+
+def index_path(shard: Path) -> Path:
+    """Name the index that stands beside a tar: ``x.tar`` has ``x.index.json``."""
+    return shard.with_suffix(".index.json")
+
+
+def write_index(shard: Path, index: ShardIndex) -> None:
+    """Write the index beside its tar, whole or not at all."""
+    plain = {"schema_version": SCHEMA_VERSION, **asdict(index)}
+    write_atomic(index_path(shard), json.dumps(plain, indent=0).encode())
+
+
+def read_index(shard: Path) -> ShardIndex:
+    """Read the index that stands beside a tar.
+
+    Raises:
+        DataError: It is missing, malformed, of another version, or of a tar of another size.
+    """
+    path = index_path(shard)
+    try:
+        plain = json.loads(path.read_bytes())
+        if plain["schema_version"] != SCHEMA_VERSION:
+            raise ValueError(f"schema version {plain['schema_version']}")
+        graphs = [IndexEntry(**entry) for entry in plain["graphs"]]
+        index = ShardIndex(tar_bytes=int(plain["tar_bytes"]), graphs=graphs)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path}: no index ({error}); delete it, it is made again") from error
+    if not shard.is_file() or shard.stat().st_size != index.tar_bytes:
+        raise DataError(
+            f"{path}: made of a tar of {index.tar_bytes} bytes, {shard.name} is missing or another;"
+            " delete the index, it is made again"
+        )
+    return index
+
+
+def load_index(shard: Path) -> ShardIndex:
+    """Read the index beside a tar, or scan the tar where the index is absent or out of date.
+
+    Raises:
+        DataError: The tar cannot be read.
+    """
+    try:
+        return read_index(shard)
+    except DataError:
+        return index_shard(shard)
+
+
+def index_shard(shard: Path) -> ShardIndex:
+    """Scan a tar for its graphs; reads headers only.
+
+    Raises:
+        DataError: The tar is missing, cut off, or the members of a graph do not stand together.
+    """
+    graphs: dict[str, dict[str, Any]] = {}
+    last = ""
+    try:
+        with tarfile.open(shard, "r:") as tar:
+            for member in tar:
+                key, _, name = member.name.partition(".")
+                if key in graphs and key != last:
+                    raise DataError(
+                        f"{shard}: members of {key} do not stand together; rebuild it with l3r-prep"
+                    )
+                last = key
+                graph = graphs.setdefault(
+                    key, {"key": key, "offset": member.offset, "num_views": 0}
+                )
+                end = member.offset_data + -(-member.size // _BLOCK) * _BLOCK
+                graph["size"] = end - graph["offset"]
+                graph["num_views"] += bool(_IMAGE.fullmatch(name))
+    except (OSError, tarfile.TarError) as error:
+        raise DataError(f"{shard}: no whole tar ({error}); rebuild it with l3r-prep") from error
+    entries = [IndexEntry(**graph) for graph in graphs.values()]
+    return ShardIndex(tar_bytes=shard.stat().st_size, graphs=entries)
+
+
+def members_from_bytes(data: bytes, where: str) -> dict[str, Any]:
+    """Split the bytes of one graph's range into members.
+
+    Args:
+        data: ``size`` bytes of the tar from ``offset``, or any part that ends between records.
+        where: What a message begins with: the shard and key.
+
+    Returns:
+        ``__key__`` and the members' bytes, as :func:`decode_graph` takes them.
+
+    Raises:
+        DataError: The bytes are cut off or hold more than one key.
+    """
+    members: dict[str, Any] = {}
+    try:
+        with tarfile.open(fileobj=io.BytesIO(data), mode="r:") as tar:
+            for member in tar:
+                stream = tar.extractfile(member)
+                key, _, name = member.name.partition(".")
+                if stream is None or members.setdefault("__key__", key) != key:
+                    raise DataError(
+                        f"{where}: found member {member.name}, expected files of one key;"
+                        " delete the shard's index, it is made again"
+                    )
+                members[name] = stream.read()
+    except tarfile.TarError as error:
+        raise DataError(
+            f"{where}: bytes cut off or no tar ({error}); delete the shard's index, it is made"
+            " again, or rebuild the shard with l3r-prep"
+        ) from error
+    return members
+
+
+def read_members(shard: Path, entry: IndexEntry) -> dict[str, Any]:
+    """Read one graph's members from its tar in one read.
+
+    Raises:
+        DataError: The range cannot be read or is not what the index says.
+    """
+    where = f"{shard.name}:{entry.key}"
+    try:
+        with shard.open("rb") as stream:
+            stream.seek(entry.offset)
+            data = stream.read(entry.size)
+    except OSError as error:
+        raise DataError(f"{where}: {error}; check the folder of shards") from error
+    if len(data) < entry.size:
+        raise DataError(
+            f"{where}: {len(data)} of {entry.size} bytes, the tar is cut off;"
+            " rebuild it with l3r-prep"
+        )
+    return members_from_bytes(data, where)

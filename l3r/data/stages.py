@@ -1,0 +1,138 @@
+"""From a stored graph to a sample of the training batch.
+
+A stage is a generator function: samples in, samples out, options by keyword. It makes new objects
+and never edits its input, so that stages compose in any loader.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, UInt8
+
+from l3r.data.schema import GraphSample
+from l3r.errors import DataError
+from l3r.types import Views
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeyedGraph:
+    """A graph and where it came from."""
+
+    key: str
+    """Shard and key, for messages and the log of skipped steps."""
+    graph: GraphSample
+
+
+def resize_crop(
+    samples: Iterable[KeyedGraph], *, image_size: tuple[int, int]
+) -> Iterator[KeyedGraph]:
+    """Bring every image to one size: crop around the principal point, then scale.
+
+    The crop is the largest of the target's aspect that is centred on the principal point, so that
+    the principal point ends up in the middle. Colour is averaged over areas; depth takes the
+    nearest sample, since the mean of two surfaces lies on neither.
+
+    Args:
+        samples: Graphs.
+        image_size: Target (height, width).
+
+    Yields:
+        Graphs whose images, depths and ``K`` match.
+
+    Raises:
+        DataError: A principal point lies outside its image.
+    """
+    for sample in samples:
+        graph = sample.graph
+        fitted = [
+            _fit_view(image, depth, K, image_size, f"{sample.key}: {file}")
+            for image, depth, K, file in zip(
+                graph.image, graph.depth, graph.K, graph.file, strict=True
+            )
+        ]
+        images, depths, Ks = zip(*fitted, strict=True)
+        resized = replace(graph, image=list(images), depth=list(depths), K=np.stack(Ks))
+        yield replace(sample, graph=resized)
+
+
+def to_views(samples: Iterable[KeyedGraph]) -> Iterator[Views]:
+    """Turn each graph, its images of one size, into a batch of one."""
+    for sample in samples:
+        graph = sample.graph
+        image = torch.from_numpy(np.stack(graph.image)).permute(0, 3, 1, 2).float() / 255
+        depth = torch.from_numpy(np.stack(graph.depth))
+        height, width = image.shape[-2:]
+        world_from_cam = np.linalg.inv(graph.cam_from_world)
+        yield Views(
+            image=image[None],
+            true_shape=torch.tensor([height, width]).expand(1, len(image), 2).clone(),
+            K=torch.from_numpy(graph.K).float()[None],
+            world_from_cam=torch.from_numpy(world_from_cam).float()[None],
+            depth=depth[None],
+            valid=(depth > 0)[None],
+            is_metric=torch.tensor([graph.is_metric]),
+            dataset=[graph.dataset],
+            scores=torch.from_numpy(graph.pairs.iou).float()[None],
+            key=[sample.key],
+        )
+
+
+def collate(batch: Sequence[Views]) -> Views:
+    """Join batches of one into a batch of many."""
+    return Views(
+        image=torch.cat([v.image for v in batch]),
+        true_shape=torch.cat([v.true_shape for v in batch]),
+        K=torch.cat([v.K for v in batch]),
+        world_from_cam=torch.cat([v.world_from_cam for v in batch]),
+        depth=torch.cat([v.depth for v in batch]),
+        valid=torch.cat([v.valid for v in batch]),
+        is_metric=torch.cat([v.is_metric for v in batch]),
+        dataset=[name for v in batch for name in v.dataset],
+        scores=torch.cat([v.scores for v in batch]),
+        key=[key for v in batch for key in v.key],
+    )
+
+
+def _fit_view(
+    image: UInt8[np.ndarray, "_h _w 3"],
+    depth: Float32[np.ndarray, "_h _w"],
+    K: Float[np.ndarray, "3 3"],
+    image_size: tuple[int, int],
+    where: str,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    left, top, width, height = _centered_crop(K, image.shape[:2], image_size, where)
+    window = (slice(top, top + height), slice(left, left + width))
+    target = (image_size[1], image_size[0])  # OpenCV's order
+    shrinks = width > target[0] or height > target[1]
+    interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    scale = np.array([[target[0] / width], [target[1] / height], [1.0]])
+    shift = np.array([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
+    return (
+        cv2.resize(image[window], target, interpolation=interpolation),
+        # Exact: takes the sample under each new pixel's centre, as K does.
+        cv2.resize(depth[window], target, interpolation=cv2.INTER_NEAREST_EXACT),
+        (K - shift) * scale,
+    )
+
+
+def _centered_crop(
+    K: Float[np.ndarray, "3 3"], size: tuple[int, int], target: tuple[int, int], where: str
+) -> tuple[int, int, int, int]:
+    """Largest whole-pixel window (left, top, width, height) of the target's aspect."""
+    height, width = size
+    half_width = min(K[0, 2], width - K[0, 2])
+    half_height = min(K[1, 2], height - K[1, 2])
+    if half_width <= 0.5 or half_height <= 0.5:
+        raise DataError(
+            f"{where}: principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) outside the image of "
+            f"{width} x {height}; rebuild the shards from right intrinsics"
+        )
+    scale = min(half_width / target[1], half_height / target[0])
+    crop_width = max(1, min(width, round(2 * scale * target[1])))
+    crop_height = max(1, min(height, round(2 * scale * target[0])))
+    left = min(max(0, round(K[0, 2] - crop_width / 2)), width - crop_width)
+    top = min(max(0, round(K[1, 2] - crop_height / 2)), height - crop_height)
+    return left, top, crop_width, crop_height

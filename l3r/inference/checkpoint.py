@@ -1,0 +1,77 @@
+"""Checkpoints: weights and the configuration that made them, nothing else needed."""
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from l3r.config import RunConfig, from_plain
+from l3r.errors import CheckpointError
+from l3r.model.light3r import Light3R
+
+MODEL_PREFIX = "model."
+"""Where the network's weights stand in a training checkpoint."""
+
+
+def load_model(path: str | Path, device: str | torch.device = "cpu") -> Light3R:
+    """Load a network, ready for inference.
+
+    Args:
+        path: A checkpoint written by ``l3r train``.
+        device: Where the network goes.
+
+    Raises:
+        CheckpointError: The file is missing, cut off, no Light3R checkpoint, or does not fit.
+    """
+    return load_model_and_config(path, device)[0]
+
+
+def load_model_and_config(
+    path: str | Path, device: str | torch.device = "cpu"
+) -> tuple[Light3R, RunConfig]:
+    """Load a network together with the configuration of the run that trained it.
+
+    Raises:
+        CheckpointError: See :func:`load_model`.
+    """
+    checkpoint = read_checkpoint(Path(path))
+    config = from_plain(checkpoint["l3r_config"], str(path))
+    model = Light3R(config.model, config.graph)
+    weights = {
+        key.removeprefix(MODEL_PREFIX): value
+        for key, value in checkpoint["state_dict"].items()
+        if key.startswith(MODEL_PREFIX)
+    }
+    try:
+        model.load_state_dict(weights)
+    except RuntimeError as error:
+        first = " ".join(str(error).split("\n")[1:2]).strip()
+        raise CheckpointError(
+            f"{path}: weights do not fit the configuration in the file: {first}"
+        ) from error
+    return model.to(device).eval(), config
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """Read a checkpoint without executing anything in it.
+
+    Raises:
+        CheckpointError: The file is missing, cut off or no Light3R checkpoint.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such file; expected a checkpoint of 'l3r train'")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, ValueError) as error:
+        reason = str(error).split("\n")[0].split(". ")[0]
+        raise CheckpointError(
+            f"{path}: cannot be read safely ({reason}); expected a checkpoint of 'l3r train'"
+        ) from error
+    missing = {"l3r_config", "state_dict"} - set(checkpoint if isinstance(checkpoint, dict) else ())
+    if missing:
+        raise CheckpointError(
+            f"{path}: no {' and no '.join(sorted(missing))} inside; expected a checkpoint of "
+            "'l3r train'"
+        )
+    return dict(checkpoint)

@@ -1,0 +1,84 @@
+"""Rotary position embedding in two dimensions, base 100."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+BASE = 100.0
+MAX_CACHED_TABLES = 64
+
+
+@dataclass(frozen=True)
+class RopeTables:
+    """Cosines and sines of every token's angles; axis 1 is (row, column), axis 2 the frequency."""
+
+    cos: Float[Tensor, "t 2 quarter"]
+    """Cosine of position times frequency."""
+    sin: Float[Tensor, "t 2 quarter"]
+    """Sine of position times frequency."""
+
+
+def rope_tables(grid_height: int, grid_width: int, head_dim: int, like: Tensor) -> RopeTables:
+    """Tabulate the rotations of a grid of tokens in row-major order.
+
+    Args:
+        grid_height: Rows of tokens.
+        grid_width: Columns of tokens.
+        head_dim: Width of an attention head, a multiple of 4.
+        like: Any tensor of the model: gives the device, and float64 where it is float64.
+
+    Returns:
+        Tables in float64 for a float64 model, else in float32, whatever autocast is in force.
+    """
+    dtype = torch.float64 if like.dtype == torch.float64 else torch.float32
+    # The compiler would trace through the cache with a warning, and make the tables all the same.
+    build = _build_tables if torch.compiler.is_compiling() else _cached_tables
+    return build(grid_height, grid_width, head_dim, dtype, like.device)
+
+
+def apply_rope(
+    q: Float[Tensor, "m heads t dim"], tables: RopeTables
+) -> Float[Tensor, "m heads t dim"]:
+    """Rotate queries or keys by their positions.
+
+    The channels of a head are four equal runs [uy | vy | ux | vx]; each pair (u, v) turns by its
+    angle. Dot products of rotated queries and keys depend on differences of positions alone.
+
+    Args:
+        q: Queries or keys.
+        tables: Of the same ``t`` tokens and head width.
+
+    Returns:
+        Rotated, in the dtype of ``q``; the rotation itself runs in the dtype of the tables.
+    """
+    u, v = q.to(tables.cos.dtype).reshape(*q.shape[:3], 2, 2, -1).unbind(dim=-2)
+    turned = (u * tables.cos - v * tables.sin, v * tables.cos + u * tables.sin)
+    return torch.stack(turned, dim=-2).flatten(-3).to(q.dtype)
+
+
+def _build_tables(
+    grid_height: int, grid_width: int, head_dim: int, dtype: torch.dtype, device: torch.device
+) -> RopeTables:
+    quarter = head_dim // 4
+    # Angles are float32 in every model, as in the released ones: a float64 model that made them
+    # in float64 would differ from theirs by 1e-7.
+    exponent = torch.arange(quarter, device=device, dtype=torch.float32) / quarter
+    frequency = 1.0 / BASE**exponent
+    rows = torch.arange(grid_height, device=device, dtype=torch.float32)
+    columns = torch.arange(grid_width, device=device, dtype=torch.float32)
+    positions = torch.cartesian_prod(rows, columns)
+    angles = (positions[:, :, None] * frequency).to(dtype)
+    return RopeTables(angles.cos(), angles.sin())
+
+
+@lru_cache(maxsize=MAX_CACHED_TABLES)
+def _cached_tables(
+    grid_height: int, grid_width: int, head_dim: int, dtype: torch.dtype, device: torch.device
+) -> RopeTables:
+    # A table first made while predicting must serve a later training step: autograd refuses
+    # tensors made in inference mode.
+    with torch.inference_mode(mode=False):
+        return _build_tables(grid_height, grid_width, head_dim, dtype, device)

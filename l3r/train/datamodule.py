@@ -1,0 +1,75 @@
+"""Loaders for the trainer, on the device that asks."""
+
+import lightning as L
+import torch
+from torch.utils.data import DataLoader, Dataset
+
+from l3r.config import RunConfig
+from l3r.data.loader import DeviceShare, StepLoader, build_training_loader, open_folders, read_graph
+from l3r.data.source import ShardFolder
+from l3r.types import Views
+
+
+class ShardData(L.LightningDataModule):
+    """Training batches by step, validation graphs one by one.
+
+    Args:
+        config: The whole run.
+    """
+
+    def __init__(self, config: RunConfig) -> None:
+        super().__init__()
+        self.config = config
+
+    def train_dataloader(self) -> StepLoader:
+        """Build the step-indexed loader; its state goes into checkpoints."""
+        trainer = self.trainer
+        assert trainer is not None
+        share = DeviceShare(rank=trainer.global_rank, world_size=trainer.world_size)
+        size = self.config.model.image_size
+        return build_training_loader(
+            self.config.data,
+            (size[0], size[1]),
+            seed=self.config.train.seed,
+            num_steps=self.config.train.max_steps,
+            share=share,
+        )
+
+    def val_dataloader(self) -> DataLoader[Views] | list[DataLoader[Views]]:
+        """Build the loader of the validation graphs; none without validation shards."""
+        data = self.config.data
+        if not data.validation:
+            return []
+        size = self.config.model.image_size
+        dataset = ValidationGraphs(
+            open_folders(data.validation, data.num_views),
+            (size[0], size[1]),
+            self.config.train.validation_graphs,
+        )
+        return DataLoader(dataset, batch_size=None, pin_memory=torch.cuda.is_available())
+
+
+class ValidationGraphs(Dataset[Views]):
+    """The same graphs every time, spread evenly over all validation shards.
+
+    Args:
+        folders: Validation shards.
+        image_size: (height, width).
+        num_graphs: Graphs at most.
+    """
+
+    def __init__(
+        self, folders: list[ShardFolder], image_size: tuple[int, int], num_graphs: int
+    ) -> None:
+        self.image_size = image_size
+        everything = [(folder, index) for folder in folders for index in range(len(folder))]
+        count = min(num_graphs, len(everything))
+        self.graphs = [everything[i * len(everything) // count] for i in range(count)]
+
+    def __len__(self) -> int:
+        return len(self.graphs)
+
+    def __getitem__(self, index: int) -> Views:
+        """Read one graph, a batch of one."""
+        folder, graph = self.graphs[index]
+        return read_graph(folder, graph, self.image_size)
