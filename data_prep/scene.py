@@ -44,8 +44,8 @@ class Scene:
         return "".join(c if c.isalnum() or c in "-_" else "-" for c in self.name)
 
     @property
-    def K(self) -> Float64[np.ndarray, "n 3 3"]:
-        """Intrinsics of all frames."""
+    def intrinsics(self) -> Float64[np.ndarray, "n 3 3"]:
+        """K of all frames."""
         return np.stack([frame.K for frame in self.frames])
 
     @property

@@ -12,9 +12,11 @@ set, and images of different shapes stack by padding with points at zero of log-
 which carry no weight anywhere.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -49,12 +51,19 @@ class Views:
 
     def pin_memory(self) -> "Views":
         """Pin every tensor; torch's loader passes a plain dataclass through unpinned otherwise."""
-        pinned: dict[str, Any] = {
-            f.name: value.pin_memory()
+        return self._map(lambda tensor: tensor.pin_memory())
+
+    def to(self, device: torch.device | str) -> "Views":
+        """Move every tensor."""
+        return self._map(lambda tensor: tensor.to(device))
+
+    def _map(self, function: Callable[[Tensor], Tensor]) -> "Views":
+        changed: dict[str, Any] = {
+            f.name: function(value)
             for f in fields(self)
             if isinstance(value := getattr(self, f.name), Tensor)
         }
-        return replace(self, **pinned)
+        return replace(self, **changed)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -142,7 +142,7 @@ def _frame(image: Path, depth: Path, world_from_cam: Float64[np.ndarray, "4 4"])
     height, width = size
     K = np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]], np.float64)
     return Frame(
-        name=image.stem,
+        name=image.name,
         image_size=size,
         K=K,
         world_from_cam=world_from_cam,

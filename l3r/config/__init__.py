@@ -3,7 +3,7 @@
 from l3r.config.data import DataConfig, SourceConfig
 from l3r.config.graph import GraphConfig
 from l3r.config.inference import InferenceConfig
-from l3r.config.layers import from_plain, load_config, to_plain, to_yaml
+from l3r.config.layers import from_plain, load_config, override_config, to_plain, to_yaml
 from l3r.config.loss import LossConfig
 from l3r.config.model import AlignmentConfig, DecoderConfig, EncoderConfig, ModelConfig
 from l3r.config.run import RunConfig
@@ -23,6 +23,7 @@ __all__ = [
     "TrainConfig",
     "from_plain",
     "load_config",
+    "override_config",
     "to_plain",
     "to_yaml",
 ]

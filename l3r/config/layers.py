@@ -31,6 +31,30 @@ def load_config(layers: Sequence[str]) -> RunConfig:
     return _to_object(config, "layers")
 
 
+def override_config(
+    config: RunConfig, overrides: Sequence[str], sections: Sequence[str]
+) -> RunConfig:
+    """Change a few values of a finished configuration, such as a checkpoint's.
+
+    Args:
+        config: Where to start; not changed.
+        overrides: ``section.key=value``.
+        sections: Sections that may be changed.
+
+    Raises:
+        ConfigError: An override is of another section, names no key, or is out of range.
+    """
+    merged = OmegaConf.merge(OmegaConf.structured(RunConfig), to_plain(config))
+    for override in overrides:
+        if "=" not in override or override.split(".")[0] not in sections:
+            raise ConfigError(
+                f"override '{override}': expected key=value of {' or '.join(sections)}, such as "
+                f"{sections[0]}.KEY=VALUE"
+            )
+        merged = _merge_override(cast(DictConfig, merged), override)
+    return _to_object(cast(DictConfig, merged), "overrides")
+
+
 def to_plain(config: RunConfig) -> dict[str, Any]:
     """Turn a configuration into builtins only, so that a checkpoint holding it loads safely."""
     return asdict(config)
@@ -61,7 +85,8 @@ def to_yaml(config: RunConfig) -> str:
 def _merge_file(config: DictConfig, layer: str) -> DictConfig:
     path = Path(layer)
     if not path.is_file():
-        hint = "an override has the form section.key=value" if not path.suffix else "check the path"
+        is_yaml = path.suffix in (".yaml", ".yml")
+        hint = "check the path" if is_yaml else "an override has the form section.key=value"
         raise ConfigError(f"layer {path}: no such file; {hint}")
     try:
         loaded = OmegaConf.load(path)

@@ -12,6 +12,8 @@ class TrainConfig:
 
     output_dir: str = "runs/train"
     """Where checkpoints, ``metrics.csv`` and ``config.yaml`` go; a run found there is resumed."""
+    note: str = ""
+    """What whoever uses the weights should know; ``l3r reconstruct`` prints it."""
     seed: int = 0
     """Seed of weights and of every sample drawn."""
     max_steps: int = 100_000

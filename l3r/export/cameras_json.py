@@ -11,6 +11,7 @@ the image at its own size, the centre of the top-left pixel at (0.5, 0.5).
 """
 
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,7 @@ def read_cameras(path: Path) -> Cameras:
     entries = loaded if older else _entries(path, loaded)
     images = [_read_image(f"{path}: image {i}", entry, older) for i, entry in enumerate(entries)]
     files = [image["file"] for image in images]
-    if repeated := sorted({file for file in files if files.count(file) > 1}):
+    if repeated := [file for file, count in Counter(files).items() if count > 1]:
         raise DataError(f"{path}: file {repeated[0]!r} appears twice; keep one entry a file")
     K = _stack([image["K"] for image in images], 3)
     return Cameras(
@@ -87,7 +88,7 @@ def _image_entry(path: Path, cameras: Cameras, index: int) -> dict[str, Any]:
     }
 
 
-def _load(path: Path) -> Any:  # noqa: ANN401  # whatever the file holds; checked by the caller
+def _load(path: Path) -> Any:  # whatever the file holds; checked by the caller
     try:
         return json.loads(path.read_bytes())
     except OSError as error:
@@ -97,7 +98,7 @@ def _load(path: Path) -> Any:  # noqa: ANN401  # whatever the file holds; checke
         raise DataError(f"{path}: not valid JSON ({reason}); write it again") from error
 
 
-def _entries(path: Path, loaded: Any) -> list[Any]:  # noqa: ANN401
+def _entries(path: Path, loaded: Any) -> list[Any]:
     if not isinstance(loaded, dict) or "version" not in loaded:
         raise DataError(f"{path}: no 'version'; expected a cameras.json as l3r writes it")
     if loaded["version"] != VERSION:
@@ -114,7 +115,7 @@ def _entries(path: Path, loaded: Any) -> list[Any]:  # noqa: ANN401
     return list(loaded["images"])
 
 
-def _read_image(where: str, entry: Any, older: bool) -> dict[str, Any]:  # noqa: ANN401
+def _read_image(where: str, entry: Any, older: bool) -> dict[str, Any]:
     if not isinstance(entry, dict):
         raise DataError(f"{where}: not an object; expected file, width, height, K, ...")
     file = entry.get("file")
@@ -144,10 +145,8 @@ def _read_camera(
 ) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "4 4"]]:
     """Intrinsics and transform of one image; NaN where it is not registered."""
     nan = torch.full((4, 4), torch.nan, dtype=torch.float64)
-    if registered or entry.get("K") is not None:
-        K = _read_K(where, entry.get("K"))
-    else:
-        K = nan[:3, :3]
+    has_K = registered or entry.get("K") is not None
+    K = _read_intrinsics(where, entry.get("K")) if has_K else nan[:3, :3]
     if older:
         K = K + torch.tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], dtype=torch.float64)
     key = "T_world_to_cam" if older else "cam_from_world"
@@ -158,7 +157,7 @@ def _read_camera(
     return K, nan
 
 
-def _read_K(where: str, value: object) -> Float[Tensor, "3 3"]:
+def _read_intrinsics(where: str, value: object) -> Float[Tensor, "3 3"]:
     K = _matrix(where, "K", value, [(3, 3)])
     bottom = torch.tensor([0, 0, 1], dtype=torch.float64)
     if not (torch.equal(K[2], bottom) and K[0, 0] > 0 and K[1, 1] > 0):
@@ -170,14 +169,10 @@ def _read_rigid(where: str, key: str, value: object) -> Float[Tensor, "4 4"]:
     """Check that the matrix turns and shifts, and does nothing else."""
     matrix = _matrix(where, key, value, [(3, 4), (4, 4)])
     rigid = torch.eye(4, dtype=torch.float64)
-    rigid[:3] = matrix[:3]
-    R = rigid[:3, :3]
+    rigid[: len(matrix)] = matrix
+    R, bottom = rigid[:3, :3], rigid[3].tolist()
     error = float((R @ R.mT - torch.eye(3, dtype=torch.float64)).abs().max())
-    if (
-        error > _ORTHONORMAL
-        or torch.linalg.det(R) < 0
-        or not torch.equal(rigid[-1], matrix[-1] if len(matrix) == 4 else rigid[-1])
-    ):
+    if error > _ORTHONORMAL or torch.linalg.det(R) < 0 or bottom != [0, 0, 0, 1]:
         raise DataError(
             f"{where}: {key!r} is not a rigid transform (R R^T is off by {error:.2g}); "
             "expected a rotation without scale or mirror, and a shift"

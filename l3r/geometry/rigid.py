@@ -23,7 +23,7 @@ def invert_rigid(b_from_a: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
 
 
 def transform_points(
-    b_from_a: Float[Tensor, "*b 4 4"], pts3d: Float[Tensor, "*b p 3"]
+    b_from_a: Float[Tensor, "*#b 4 4"], pts3d: Float[Tensor, "*#b p 3"]
 ) -> Float[Tensor, "*b p 3"]:
     """Move points from frame a to frame b; leading dimensions broadcast."""
     R, t = b_from_a[..., :3, :3], b_from_a[..., :3, 3]

@@ -1,12 +1,13 @@
 """Checkpoints: weights and the configuration that made them, nothing else needed."""
 
 import pickle
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from l3r.config import RunConfig, from_plain
+from l3r.config import RunConfig, from_plain, load_config, override_config
 from l3r.errors import CheckpointError
 from l3r.model.light3r import Light3R
 
@@ -28,15 +29,22 @@ def load_model(path: str | Path, device: str | torch.device = "cpu") -> Light3R:
 
 
 def load_model_and_config(
-    path: str | Path, device: str | torch.device = "cpu"
+    path: str | Path, device: str | torch.device = "cpu", settings: Sequence[str] = ()
 ) -> tuple[Light3R, RunConfig]:
     """Load a network together with the configuration of the run that trained it.
 
+    Args:
+        path: A checkpoint written by ``l3r train``.
+        device: Where the network goes.
+        settings: ``inference.key=value`` and ``graph.key=value`` to change.
+
     Raises:
         CheckpointError: See :func:`load_model`.
+        ConfigError: A setting cannot be used.
     """
     checkpoint = read_checkpoint(Path(path))
     config = from_plain(checkpoint["l3r_config"], str(path))
+    config = override_config(config, settings, ("inference", "graph"))
     model = Light3R(config.model, config.graph)
     weights = {
         key.removeprefix(MODEL_PREFIX): value
@@ -51,6 +59,19 @@ def load_model_and_config(
             f"{path}: weights do not fit the configuration in the file: {first}"
         ) from error
     return model.to(device).eval(), config
+
+
+def build_untrained(
+    layers: Sequence[str], device: str | torch.device = "cpu"
+) -> tuple[Light3R, RunConfig]:
+    """Build a network with the fresh weights that a training run of these layers starts from.
+
+    Raises:
+        ConfigError: The layers cannot be used.
+    """
+    config = load_config(layers)
+    torch.manual_seed(config.train.seed)
+    return Light3R(config.model, config.graph).to(device).eval(), config
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

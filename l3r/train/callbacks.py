@@ -158,12 +158,12 @@ class CsvLog(Callback):
         if step % self.every == 0 or step == trainer.max_steps:
             rate = trainer.optimizers[0].param_groups[0]["lr"]
             row = _numbers(trainer.callback_metrics, "train/")
-            _append_row(self.training, {"step": step, "lr": rate, **row})
+            _append_row(self.training, {"step": float(step), "lr": float(rate), **row})
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Write a validation row."""
         row = _numbers(trainer.callback_metrics, "val/")
-        _append_row(self.validation, {"step": trainer.global_step, **row})
+        _append_row(self.validation, {"step": float(trainer.global_step), **row})
 
 
 class StepProgress(Callback):

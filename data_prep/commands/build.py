@@ -1,0 +1,168 @@
+"""``l3r-prep build``: a raw data set becomes shards of graphs.
+
+Relates all frames of each scene, draws graphs by the greedy rule and writes tars, indices and
+manifest.json. Interrupted, the same command goes on where it stopped; finished shards are left
+alone. A scene is a trajectory.
+
+example, of each source:
+  l3r-prep build tartanair --raw TartanAir/ --out shards/tartanair --frame-step 4
+  l3r-prep build synthetic --raw raw/room --out shards/room --num-graphs 4000 --max-views 8
+"""
+
+import argparse
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from data_prep.commands.room_options import ROOM_DEFAULTS, add_room_arguments, room_request
+from l3r.errors import DataError
+
+if TYPE_CHECKING:
+    from data_prep.scene import Scene
+
+_RAW_DEFAULTS: dict[str, Any] = {"scenes": "*", "split": "train", "frame_step": 1, "held_out": 0.0}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments; an option of one source alone has no default here."""
+    add = parser.add_argument
+    add("dataset", choices=["tartanair", "synthetic"], help="what to read")
+    add(
+        "--raw",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder of the raw data; for synthetic it is rendered there where absent",
+    )
+    add("--out", type=Path, required=True, metavar="DIR", help="folder to write to")
+    add("--num-graphs", type=int, default=1000, metavar="N", help="graphs of each scene (1000)")
+    add("--graphs-per-shard", type=int, default=100, metavar="N", help="graphs of each tar (100)")
+    add("--max-views", type=int, default=10, metavar="N", help="most images of a graph (10)")
+    add("--min-views", type=int, metavar="N", help="fewest images of a graph (8, or --max-views)")
+    add("--seed", type=int, default=0, metavar="N", help="seed of the draw (0)")
+    add("--workers", type=int, default=0, metavar="N", help="processes that encode (0: this one)")
+    raw = parser.add_argument_group("tartanair")
+    raw.add_argument("--scenes", metavar="GLOB", help="pattern on ENV/LEVEL/PNNN (*)")
+    raw.add_argument(
+        "--split",
+        choices=["train", "test", "all"],
+        help="train leaves out DROID-SLAM's 32 test trajectories (train)",
+    )
+    raw.add_argument("--frame-step", type=int, metavar="N", help="take every so many frames (1)")
+    raw.add_argument(
+        "--held-out",
+        type=float,
+        metavar="SHARE",
+        help="write OUT/train and OUT/val, the last SHARE of each scene's frames (0)",
+    )
+    add_room_arguments(
+        parser.add_argument_group(
+            "synthetic", "with held-out views it writes OUT/train and OUT/val"
+        )
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Build every part and print a line for each."""
+    from data_prep.commands.threads import use_one_thread
+
+    use_one_thread()
+    _refuse_foreign(args)
+    parts = _tartanair_parts(args) if args.dataset == "tartanair" else _synthetic_parts(args)
+    for folder, scenes, num_graphs, source in parts:
+        sys.stdout.write(_build(args, folder, scenes, num_graphs, source))
+    return 0
+
+
+def _refuse_foreign(args: argparse.Namespace) -> None:
+    foreign = list(ROOM_DEFAULTS) if args.dataset == "tartanair" else list(_RAW_DEFAULTS)
+    for key in foreign:
+        if getattr(args, key) is not None:
+            raise DataError(
+                f"--{key.replace('_', '-')} has no effect on {args.dataset}; leave it out"
+            )
+
+
+Part = tuple[Path, Iterable["Scene"], int, dict[str, Any]]
+"""Folder of shards, what goes in, graphs of each scene, options to record."""
+
+
+def _tartanair_parts(args: argparse.Namespace) -> list[Part]:
+    from data_prep.converters import tartanair
+    from data_prep.plan import hold_out
+
+    source = {
+        key: default if getattr(args, key) is None else getattr(args, key)
+        for key, default in _RAW_DEFAULTS.items()
+    }
+    share = source["held_out"]
+    if not 0 <= share < 1 or source["frame_step"] < 1:
+        raise DataError(
+            f"--held-out is {share} and --frame-step {source['frame_step']}, expected a share from"
+            " 0 to less than 1 and 1 or more"
+        )
+
+    def read() -> Iterable["Scene"]:
+        return tartanair.read(
+            args.raw, source["split"], scenes=source["scenes"], frame_step=source["frame_step"]
+        )
+
+    if not share:
+        return [(args.out, read(), args.num_graphs, source)]
+    kept = (hold_out(scene, share)[0] for scene in read())
+    held = (hold_out(scene, share)[1] for scene in read())
+    num_held = max(1, round(share * args.num_graphs))
+    return [
+        (args.out / "train", kept, args.num_graphs, source),
+        (args.out / "val", held, num_held, source),
+    ]
+
+
+def _synthetic_parts(args: argparse.Namespace) -> list[Part]:
+    from data_prep.commands.progress import show_progress
+    from data_prep.converters import synthetic, tartanair
+
+    request = room_request(args)
+    with show_progress() as report:
+        synthetic.write_room(args.raw, request, report=report)
+
+    def read(trajectory: str) -> Iterable["Scene"]:
+        pattern = f"{request.environment}/Easy/{trajectory}"
+        return tartanair.read(args.raw, "all", scenes=pattern, dataset="synthetic")
+
+    source = {"scene_seed": request.scene_seed, "size": list(request.image_size)}
+    if not request.num_held_out:
+        return [(args.out, read("P000"), args.num_graphs, source)]
+    num_held = max(1, round(args.num_graphs * request.num_held_out / request.num_views))
+    return [
+        (args.out / "train", read("P000"), args.num_graphs, source),
+        (args.out / "val", read("P001"), num_held, source),
+    ]
+
+
+def _build(
+    args: argparse.Namespace,
+    folder: Path,
+    scenes: Iterable["Scene"],
+    num_graphs: int,
+    source: dict[str, Any],
+) -> str:
+    from data_prep.commands.progress import show_progress
+    from data_prep.graph_sampling import SamplingOptions
+    from data_prep.shards import BuildRequest, build_shards
+
+    min_views = min(8, args.max_views) if args.min_views is None else args.min_views
+    request = BuildRequest(
+        num_graphs=num_graphs,
+        graphs_per_shard=args.graphs_per_shard,
+        seed=args.seed,
+        sampling=SamplingOptions(min_views=min_views, max_views=args.max_views),
+        source=source,
+    )
+    with show_progress() as report:
+        manifest = build_shards(scenes, folder, request, num_workers=args.workers, report=report)
+    return (
+        f"{folder}: {manifest.num_graphs} graphs in {len(manifest.shards)} shards,"
+        f" {manifest.num_bytes / 1e6:.1f} MB\n"
+    )

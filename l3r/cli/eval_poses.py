@@ -1,0 +1,59 @@
+"""``l3r eval poses``: score cameras against trusted ones.
+
+Prints RRA, RTA and mAA in percent, and the error of the camera centres (ATE). Images are matched by
+name; the scales and frames of the two sides do not matter.
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.epilog = "example: l3r eval poses --pred out/ --gt scene/cameras.json --missing fail"
+    source = "cameras.json, the folder of one, or a COLMAP model"
+    parser.add_argument("--pred", type=Path, required=True, metavar="OUT", help=source)
+    parser.add_argument("--gt", type=Path, required=True, metavar="PATH", help=source)
+    parser.add_argument(
+        "--missing",
+        choices=("fail", "exclude_image", "exclude_scene"),
+        default="fail",
+        help="pairs of images without camera count as wrong (default), or are left out; or count "
+        "as wrong, but a scene without any camera has no accuracy",
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the scores there too")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print a table of scores on standard output."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from l3r.eval.poses import evaluate_cameras, load_cameras
+    from l3r.export.atomic import atomic_write_text
+
+    result = evaluate_cameras(load_cameras(args.pred), load_cameras(args.gt), args.missing)
+    m = result.metrics
+    table = Table()
+    for heading in ("", "5 deg", "15 deg", "30 deg", "mAA@30"):
+        table.add_column(heading, justify="right" if heading else "left")
+    one = "{:.1f}".format
+    table.add_row("RRA %", *map(one, (m.rra_5, m.rra_15, m.rra_30)), "")
+    table.add_row("RTA %", *map(one, (m.rta_5, m.rta_15, m.rta_30)), one(m.maa_30))
+    signed = (m.rta_5_signed, m.rta_15_signed, m.rta_30_signed, m.maa_30_signed)
+    table.add_row("RTA % signed", *map(one, signed))
+    table.add_row("min(RRA, RTA)", "", "", "", one(m.maa_30_min))
+    console = Console(file=sys.stdout, width=80, highlight=False, markup=False)
+    console.print(f"{args.pred} against {args.gt}")
+    console.print(table)
+    console.print(f"ATE {m.ate:.5f} normalised, {m.ate_rmse:.4g} RMSE in units of the truth")
+    console.print(
+        f"registered {result.num_registered} of {result.num_images} images ({m.reg:.1f} %), "
+        f"{result.num_images - result.num_found} not in the prediction"
+    )
+    console.print(f"missing: {result.missing}; near-coincident true pairs: {result.num_short}")
+    if args.json:
+        atomic_write_text(args.json, json.dumps(result.to_dict(), indent=1) + "\n")
+    return 0

@@ -1,0 +1,165 @@
+import itertools
+import logging
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from l3r.config import DataConfig, SourceConfig
+from l3r.data.loader import DeviceShare, build_training_loader, read_graph
+from l3r.data.sampling import SampleChooser
+from l3r.data.schema import index_path
+from l3r.data.source import ShardFolder
+from l3r.errors import ConfigError, DataError
+from tests.data.graphs import make_graph, write_folder
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("shards") / "train"
+    return write_folder(folder, [make_graph(n, height=16, width=16) for n in range(10)])
+
+
+def config(*folders, **changes):
+    sources = {f"s{i}": SourceConfig(shards=str(folder)) for i, folder in enumerate(folders)}
+    return DataConfig(
+        sources=sources, **{"num_views": 3, "graphs_per_step": 4, "num_workers": 0, **changes}
+    )
+
+
+def loader(data, num_steps=6, seed=0, **share):
+    return build_training_loader(
+        data, (16, 16), seed=seed, num_steps=num_steps, share=DeviceShare(**share)
+    )
+
+
+def keys(batches):
+    return [batch.key for batch in batches]
+
+
+def test_the_same_seed_gives_the_same_batches_and_another_seed_others(shards):
+    first, second = loader(config(shards)), loader(config(shards))
+    for one, two in zip(first, second, strict=True):
+        assert one.key == two.key
+        assert torch.equal(one.image, two.image)
+    assert keys(loader(config(shards), seed=1)) != keys(loader(config(shards)))
+
+
+def test_going_on_from_a_saved_step_gives_what_would_have_come(shards):
+    everything = keys(loader(config(shards)))
+    stopped = loader(config(shards))
+    assert keys(itertools.islice(stopped, 2)) == everything[:2]
+    # The loader counted a batch when it was asked for: two were handed out.
+    state = stopped.state_dict()
+    assert state == {"step": 2}
+    resumed = loader(config(shards))
+    resumed.load_state_dict(state)
+    assert keys(resumed) == everything[2:]
+
+
+def test_workers_change_nothing_even_over_a_resume(shards):
+    everything = keys(loader(config(shards)))
+    resumed = loader(config(shards, num_workers=2))
+    resumed.load_state_dict({"step": 3})
+    assert keys(resumed) == everything[3:]
+
+
+@pytest.mark.parametrize("world_size", [2, 4])
+def test_devices_share_out_exactly_the_samples_of_one(shards, world_size):
+    whole = keys(loader(config(shards)))
+    parts = [keys(loader(config(shards), rank=r, world_size=world_size)) for r in range(world_size)]
+    for step, expected in enumerate(whole):
+        slots = [None] * 4
+        for rank in range(world_size):
+            slots[rank::world_size] = parts[rank][step]
+        assert slots == expected
+
+
+def test_every_graph_comes_once_before_any_comes_again(shards):
+    drawn = list(itertools.chain.from_iterable(keys(loader(config(shards), num_steps=5))))
+    assert len(set(drawn[:10])) == 10
+    assert len(set(drawn[10:20])) == 10
+
+
+@given(st.integers(0, 2**31), st.lists(st.integers(1, 30), min_size=1, max_size=3))
+def test_the_choice_depends_on_seed_step_and_slot_alone(seed, sizes):
+    weights = [1.0 + i for i in range(len(sizes))]
+    forwards = SampleChooser(sizes, weights, 4, seed)
+    backwards = SampleChooser(sizes, weights, 4, seed)
+    table = {(s, t): forwards.choose(s, t) for s in range(8) for t in range(4)}
+    again = {(s, t): backwards.choose(s, t) for s in reversed(range(8)) for t in reversed(range(4))}
+    assert table == again
+    for source, graph in table.values():
+        assert 0 <= graph < sizes[source]
+
+
+def test_sources_come_as_often_as_they_weigh():
+    chooser = SampleChooser([50, 50], [3.0, 1.0], 8, 0)
+    draws = [chooser.choose(step, slot)[0] for step in range(250) for slot in range(8)]
+    assert draws.count(0) / len(draws) == pytest.approx(0.75, abs=0.04)
+
+
+def test_a_graph_is_read_in_greedy_order_and_cut_to_its_first_views(shards):
+    folder = ShardFolder(shards, 3)
+    sample = folder.read(7)
+    assert sample.key == "train/hand-000001.tar:hand-000007"
+    assert sample.graph.file == ["7-0.png", "7-1.png", "7-2.png"]
+    views = read_graph(folder, 7, (16, 16))
+    assert views.image.shape == (1, 3, 3, 16, 16)
+    assert views.depth[0, 2, 0, 0] == 3
+
+
+def test_shards_without_an_index_are_scanned(tmp_path):
+    folder = write_folder(tmp_path, [make_graph(n, height=16, width=16) for n in range(2)])
+    assert not index_path(folder / "hand-000000.tar").exists()
+    assert len(ShardFolder(folder, 3)) == 2
+
+
+def spoil(folder, number):
+    """Overwrite the first bytes of a graph's first JPEG."""
+    shard = folder / f"hand-{number // 4:06d}.tar"
+    content = bytearray(shard.read_bytes())
+    at = content.index(f"hand-{number:06d}.00.jpg".encode()) + 512
+    content[at : at + 64] = b"\0" * 64
+    shard.write_bytes(content)
+
+
+def test_an_unreadable_sample_is_named_and_another_takes_its_place(tmp_path, caplog):
+    folder = write_folder(tmp_path, [make_graph(n, height=16, width=16) for n in range(10)])
+    spoil(folder, 2)
+    with caplog.at_level(logging.WARNING):
+        batches = keys(loader(config(folder, max_skip_rate=0.5), num_steps=5))
+    assert all(len(batch) == 4 for batch in batches)
+    drawn = list(itertools.chain.from_iterable(batches))
+    assert not any(key.endswith(":hand-000002") for key in drawn)
+    assert "hand-000002" in caplog.text
+    assert "00.jpg" in caplog.text
+
+
+def test_too_many_unreadable_samples_stop_the_run(tmp_path):
+    folder = write_folder(tmp_path, [make_graph(n, height=16, width=16) for n in range(10)])
+    for number in range(0, 10, 2):
+        spoil(folder, number)
+    with pytest.raises(DataError, match=r"max_skip_rate=0.01.*l3r-prep check"):
+        keys(loader(config(folder), num_steps=200))
+
+
+def test_nothing_readable_stops_at_once(tmp_path):
+    folder = write_folder(tmp_path, [make_graph(n, height=16, width=16) for n in range(2)])
+    for number in range(2):
+        spoil(folder, number)
+    with pytest.raises(DataError, match="no graph of source hand can be read"):
+        keys(loader(config(folder, max_skip_rate=1.0)))
+
+
+def test_requests_that_cannot_be_met_say_what_to_do(shards, tmp_path):
+    with pytest.raises(ConfigError, match=r"data\.sources is empty"):
+        loader(config())
+    with pytest.raises(ConfigError, match="multiple of the 3 devices"):
+        loader(config(shards), world_size=3)
+    with pytest.raises(DataError, match=r"manifest\.json: no such file"):
+        loader(config(tmp_path))
+    small = write_folder(tmp_path / "small", [make_graph(0, num_views=2, height=16, width=16)])
+    with pytest.raises(DataError, match="no graph of 3 images"):
+        loader(config(small))
