@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     from rich.table import Table
 
     from l3r.eval.poses import evaluate_cameras, load_cameras
-    from l3r.export.atomic import atomic_write_text
+    from l3r.files import write_atomic
 
     result = evaluate_cameras(load_cameras(args.pred), load_cameras(args.gt), args.missing)
     m = result.metrics
@@ -55,5 +55,5 @@ def run(args: argparse.Namespace) -> int:
     )
     console.print(f"missing: {result.missing}; near-coincident true pairs: {result.num_short}")
     if args.json:
-        atomic_write_text(args.json, json.dumps(result.to_dict(), indent=1) + "\n")
+        write_atomic(args.json, json.dumps(result.to_dict(), indent=1) + "\n")
     return 0

@@ -29,7 +29,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = importlib.import_module(f"l3r.cli.{name.replace(' ', '_')}")
     parser = argparse.ArgumentParser(
         prog=f"l3r {name}",
-        description=command.__doc__.split("\n", 1)[1].strip(),
+        description=str(command.__doc__).split("\n", 1)[1].strip(),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     command.add_arguments(parser)

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from l3r.errors import DataError
-from l3r.export.atomic import atomic_write_text
+from l3r.files import write_atomic
 from l3r.types import Cameras
 
 VERSION = 1
@@ -37,7 +37,7 @@ def write_cameras(path: Path, cameras: Cameras) -> None:
     images = [_image_entry(path, cameras, index) for index in range(len(cameras.file))]
     lines = ",\n".join(json.dumps(image, ensure_ascii=False, allow_nan=False) for image in images)
     head = f'{{"version": {VERSION}, "pixel_center": 0.5, "images": [\n'
-    atomic_write_text(path, f"{head}{lines}\n]}}\n")
+    write_atomic(path, f"{head}{lines}\n]}}\n")
 
 
 def read_cameras(path: Path) -> Cameras:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from l3r.errors import DataError
-from l3r.export.atomic import flush_to_disk, hidden_sibling
+from l3r.files import flush_to_disk, hidden_sibling
 
 
 def check_output(out: Path) -> None:

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from l3r.export.atomic import atomic_path
 from l3r.export.points import PointSelection, sample_points
+from l3r.files import atomic_path
 from l3r.types import Reconstruction
 
 _VERTEX = [

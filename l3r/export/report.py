@@ -8,10 +8,10 @@ from typing import Any
 import jinja2
 import torch
 
-from l3r.export.atomic import atomic_write_text
 from l3r.export.plan import draw_plan, edge_steps, tree_similarity
 from l3r.export.run_json import RunRecord, num_components
 from l3r.export.thumbnails import Picture, confidence_picture, depth_picture, photo_picture
+from l3r.files import write_atomic
 from l3r.types import Reconstruction
 from l3r.version import __version__
 
@@ -31,7 +31,7 @@ def write_report(
         record: Warnings, skipped images, command and diagnostics.
         seconds: Wall time of every stage, those of the export included; by default the scene's.
     """
-    atomic_write_text(path, render_report(scene, record, seconds))
+    write_atomic(path, render_report(scene, record, seconds))
 
 
 def render_report(

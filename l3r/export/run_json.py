@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from l3r.export.atomic import atomic_write_text
+from l3r.files import write_atomic
 from l3r.types import Reconstruction
 from l3r.version import __version__
 
@@ -72,7 +72,7 @@ def write_run(
         "files": list(record.files),
     }
     text = json.dumps(_finite(content), indent=1, ensure_ascii=False, allow_nan=False)
-    atomic_write_text(path, text + "\n")
+    write_atomic(path, text + "\n")
 
 
 def device_name() -> str:

@@ -81,6 +81,7 @@ def reconstruct_folder(
         skipped=loaded.skipped,
         warnings=warnings,
         upright=loaded.upright,
+        device=str(clock.device),
     )
     return _summary(scene, out, warnings, time.perf_counter() - began)
 

@@ -2,20 +2,20 @@ import os
 
 import pytest
 
-from l3r.export.atomic import atomic_path, atomic_write_bytes, atomic_write_text
+from l3r.files import atomic_path, write_atomic
 
 
 def test_a_file_is_replaced_as_a_whole(tmp_path):
     path = tmp_path / "a.txt"
-    atomic_write_text(path, "old\n")
-    atomic_write_text(path, "größer\n")
+    write_atomic(path, "old\n")
+    write_atomic(path, "größer\n")
     assert path.read_bytes() == "größer\n".encode()
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.txt"]
 
 
 def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
     path = tmp_path / "a.bin"
-    atomic_write_bytes(path, b"old")
+    write_atomic(path, b"old")
 
     def interrupted():
         with atomic_path(path) as temporary:
@@ -31,7 +31,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
 def test_others_may_read_the_file_as_the_umask_says(tmp_path):
     before = os.umask(0o022)
     try:
-        atomic_write_bytes(tmp_path / "a", b"")
+        write_atomic(tmp_path / "a", b"")
     finally:
         os.umask(before)
     assert (tmp_path / "a").stat().st_mode & 0o777 == 0o644
