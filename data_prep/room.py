@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, fields
-from typing import Self
 
 import torch
 from jaxtyping import Float
@@ -15,6 +14,10 @@ _CLEARANCE = 0.35
 """Least distance of a camera from any surface [m]."""
 _NUM_CURVES = 512
 """Curves tried for a walk."""
+_BEND = 0.98
+"""Least cosine between directions 1/256 of a walk apart: no cusps."""
+_HARMONICS = torch.arange(1, 4).float()
+"""Frequencies a walk is made of."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,10 +45,10 @@ class Room:
     amplitude: Float[Tensor, "f w 3"]
     """Strength of each wave in each colour."""
 
-    def to(self, device: torch.device | str) -> Self:
+    def to(self, device: torch.device | str) -> "Room":
         """Copy the room to a device."""
         moved = {f.name: getattr(self, f.name).to(device) for f in fields(self)}
-        return type(self)(**moved)
+        return Room(**moved)
 
     @property
     def size(self) -> Float[Tensor, "3"]:
@@ -138,20 +141,33 @@ def draw_walk(room: Room, num_views: int, seed: int) -> Float[Tensor, "n 4 4"]:
         ``world_from_cam``, OpenCV camera axes, float64.
     """
     draw = torch.Generator().manual_seed(seed)
-    time = torch.arange(num_views) * (2 * math.pi / max(num_views, 1))
-    harmonic = torch.arange(1, 4).float()
-    wave = torch.stack([torch.cos(time[:, None] * harmonic), torch.sin(time[:, None] * harmonic)])
-    weight = torch.randn(_NUM_CURVES, 2, 3, 3, generator=draw) / harmonic[:, None] ** 1.5
-    curve = torch.einsum("pth,cphx->ctx", wave, weight)
-    position = _inside(room, 0.5 + 0.18 * curve)
-    gap = clearance(room, position.reshape(-1, 3)).reshape(_NUM_CURVES, num_views).amin(1)
-    clear = (gap > _CLEARANCE).int()
-    best = position[int(clear.argmax() if clear.any() else gap.argmax())]
-    ahead = best.roll(-1, 0) - best.roll(1, 0)
-    heading = torch.atan2(ahead[:, 1], ahead[:, 0]) + 0.6 * torch.sin(3 * time)
+    weight = torch.randn(_NUM_CURVES, 2, 3, 3, generator=draw) / _HARMONICS[:, None] ** 2
+    fine = _curve(room, weight, 256)
+    gap = clearance(room, fine.reshape(-1, 3)).reshape(_NUM_CURVES, -1).amin(1)
+    ahead = torch.nn.functional.normalize(fine.roll(-1, 1) - fine, dim=-1)
+    bend = (ahead * ahead.roll(-1, 1)).sum(-1).amin(1)
+    good = ((gap > _CLEARANCE) & (bend > _BEND)).int()
+    chosen = int(good.argmax() if good.any() else (gap + bend).argmax())
+    position = _curve(room, weight[chosen : chosen + 1], num_views)[0]
+    time = _loop(num_views)
+    along = _curve(room, weight[chosen : chosen + 1], 16 * num_views)[0]
+    step = (along.roll(-1, 0) - along.roll(1, 0))[::16]
+    heading = torch.atan2(step[:, 1], step[:, 0]) + 0.6 * torch.sin(3 * time)
     forward = torch.stack([heading.cos(), heading.sin(), 0.15 + 0.1 * torch.sin(2 * time)], dim=-1)
     roll = 0.05 * torch.sin(5 * time)
-    return _look(best.double(), forward.double(), roll.double())
+    return _look(position.double(), forward.double(), roll.double())
+
+
+def _loop(num_views: int) -> Float[Tensor, " n"]:
+    """Evenly spaced angles around the circle."""
+    return torch.arange(num_views) * (2 * math.pi / max(num_views, 1))
+
+
+def _curve(room: Room, weight: Float[Tensor, "c 2 3 3"], num_views: int) -> Float[Tensor, "c n 3"]:
+    """Evaluate closed curves of three harmonics within the room."""
+    angle = _loop(num_views)[:, None] * _HARMONICS
+    wave = torch.stack([angle.cos(), angle.sin()])
+    return _inside(room, 0.5 + 0.2 * torch.einsum("pth,cphx->ctx", wave, weight))
 
 
 def clearance(room: Room, pts3d_world: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:

@@ -188,7 +188,7 @@ def write_shard(path: Path, cache: FrameCache, plans: list[GraphPlan]) -> ShardE
 def _graph_sample(cache: FrameCache, plan: GraphPlan) -> GraphSample:
     scene = cache.scene
     frames = [cache.read(view) for view in plan.views]
-    world_from_cam = scene.world_from_cam[plan.views]
+    world_from_cam = np.stack([scene.frames[view].world_from_cam for view in plan.views])
     return GraphSample(
         dataset=scene.dataset,
         scene=scene.name,

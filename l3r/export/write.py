@@ -73,11 +73,8 @@ def write_reconstruction(
     with staged_folder(out) as folder:
         if upright:
             _timed(seconds, "images", lambda: _write_upright(folder / "images", upright))
-        _timed(
-            seconds,
-            "colmap",
-            lambda: write_colmap(folder / "sparse" / "0", reconstruction, for_colmap),
-        )
+        model = folder / "sparse" / "0"
+        _timed(seconds, "colmap", lambda: write_colmap(model, reconstruction, for_colmap))
         _timed(seconds, "ply", lambda: write_ply(folder / "points.ply", reconstruction, for_ply))
         cameras = reconstruction.cameras
         _timed(seconds, "cameras", lambda: write_cameras(folder / "cameras.json", cameras))

@@ -1,6 +1,8 @@
 """Checkpoints: weights and the configuration that made them, nothing else needed."""
 
 import pickle
+import struct
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,19 @@ from l3r.config import RunConfig, from_plain, load_config, override_config
 from l3r.errors import CheckpointError
 from l3r.model.light3r import Light3R
 
+_UNREADABLE = (
+    pickle.UnpicklingError,
+    struct.error,
+    ArithmeticError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
+"""What torch's restricted unpickler raises on bytes that are no checkpoint."""
 MODEL_PREFIX = "model."
 """Where the network's weights stand in a training checkpoint."""
 
@@ -83,8 +98,10 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise CheckpointError(f"{path}: no such file; expected a checkpoint of 'l3r train'")
     try:
+        if not zipfile.is_zipfile(path):  # torch would fall back to bare pickles
+            raise ValueError("no zip archive")
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, ValueError) as error:
+    except _UNREADABLE as error:
         reason = str(error).split("\n")[0].split(". ")[0]
         raise CheckpointError(
             f"{path}: cannot be read safely ({reason}); expected a checkpoint of 'l3r train'"

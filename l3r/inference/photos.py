@@ -2,6 +2,7 @@
 
 import io
 import logging
+import math
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -106,10 +107,9 @@ def network_size(height: int, width: int, config: ModelConfig) -> tuple[int, int
     """Size (height, width) at which the network sees a photo."""
     patch = config.encoder.patch_size
     scale = max(config.image_size) / max(height, width)
-    return (
-        max(1, round(height * scale / patch)) * patch,
-        max(1, round(width * scale / patch)) * patch,
-    )
+    # Halves go up: Python's round would send 10.5 down and 11.5 up.
+    rows, columns = (math.floor(side * scale / patch + 0.5) for side in (height, width))
+    return max(1, rows) * patch, max(1, columns) * patch
 
 
 _UNREADABLE = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)

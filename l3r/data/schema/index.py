@@ -93,7 +93,7 @@ def index_shard(shard: Path) -> ShardIndex:
         DataError: The tar is missing, cut off, or the members of a graph do not stand together.
     """
     graphs: dict[str, dict[str, Any]] = {}
-    last = ""
+    last, end = "", 0
     try:
         with tarfile.open(shard, "r:") as tar:
             for member in tar:
@@ -109,6 +109,9 @@ def index_shard(shard: Path) -> ShardIndex:
                 end = member.offset_data + -(-member.size // _BLOCK) * _BLOCK
                 graph["size"] = end - graph["offset"]
                 graph["num_views"] += bool(_IMAGE.fullmatch(name))
+        # A tar cut off within a header reads like one that ends; only its end mark is missing.
+        if shard.stat().st_size < end + 2 * _BLOCK:
+            raise tarfile.ReadError("the mark at its end is missing")
     except (OSError, tarfile.TarError) as error:
         raise DataError(f"{shard}: no whole tar ({error}); rebuild it with l3r-prep") from error
     entries = [IndexEntry(**graph) for graph in graphs.values()]

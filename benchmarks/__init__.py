@@ -1,0 +1,1 @@
+"""What measures speed and memory; each module has ``run() -> list[(name, value)]``."""

@@ -1,0 +1,39 @@
+"""Join what the demo measured: a table on standard output, and ``metrics.json``."""
+
+import json
+import sys
+from pathlib import Path
+
+from l3r.files import write_atomic
+
+SHOWN = ("rra_5", "rra_15", "rta_5", "rta_15", "ate", "reg")
+
+
+def main(folder: Path) -> None:
+    """Read the parts in the demo's folder, print, write."""
+    trained = json.loads((folder / "trained.json").read_text())
+    untrained = json.loads((folder / "untrained.json").read_text())
+    rows = {
+        "untrained": untrained["network"],
+        "identity": trained["identity"],
+        "trained": trained["network"],
+    }
+    stages = [line.split() for line in (folder / "seconds.txt").read_text().splitlines()]
+    seconds = {name: int(value) for name, value in stages}
+    metrics = {name: {key: values[key] for key in SHOWN} for name, values in rows.items()}
+    content = {**metrics, "num_graphs": trained["num_graphs"], "seconds": seconds}
+    write_atomic(folder / "metrics.json", json.dumps(content, indent=2) + "\n")
+
+    out = sys.stdout.write
+    out(f"\n{trained['num_graphs']} held-out graphs of 8 images, cameras never seen in training\n")
+    out(f"{'':<12}" + "".join(f"{key:>9}" for key in SHOWN) + "\n")
+    for name, values in metrics.items():
+        cells = [f"{values[key]:>9.{3 if key == 'ate' else 1}f}" for key in SHOWN]
+        out(f"{name:<12}" + "".join(cells) + "\n")
+    out("percent, but for ate (lower is better)\n\n")
+    out("seconds: " + ", ".join(f"{name} {value}" for name, value in seconds.items()) + "\n")
+    out(f"metrics: {folder / 'metrics.json'}   look at {folder / 'reconstruction/report.html'}\n")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
