@@ -12,10 +12,10 @@ NUM_WAVES = 3
 
 _CLEARANCE = 0.35
 """Least distance of a camera from any surface [m]."""
-_NUM_CURVES = 512
+_NUM_CURVES = 1024
 """Curves tried for a walk."""
 _BEND = 0.98
-"""Least cosine between directions 1/256 of a walk apart: no cusps."""
+"""Least cosine between headings 1/256 of a walk apart: no cusps."""
 _HARMONICS = torch.arange(1, 4).float()
 """Frequencies a walk is made of."""
 
@@ -144,7 +144,7 @@ def draw_walk(room: Room, num_views: int, seed: int) -> Float[Tensor, "n 4 4"]:
     weight = torch.randn(_NUM_CURVES, 2, 3, 3, generator=draw) / _HARMONICS[:, None] ** 2
     fine = _curve(room, weight, 256)
     gap = clearance(room, fine.reshape(-1, 3)).reshape(_NUM_CURVES, -1).amin(1)
-    ahead = torch.nn.functional.normalize(fine.roll(-1, 1) - fine, dim=-1)
+    ahead = torch.nn.functional.normalize((fine.roll(-1, 1) - fine)[..., :2], dim=-1)
     bend = (ahead * ahead.roll(-1, 1)).sum(-1).amin(1)
     good = ((gap > _CLEARANCE) & (bend > _BEND)).int()
     chosen = int(good.argmax() if good.any() else (gap + bend).argmax())

@@ -100,11 +100,12 @@ def check_parses(words):
     code = (
         "import argparse, sys\n"
         f"from {module} import main\n"
-        "real = argparse.ArgumentParser.parse_args\n"
-        "def parse(self, *a, **k):\n"
-        "    real(self, *a, **k)\n"
-        "    sys.exit(0)\n"
-        "argparse.ArgumentParser.parse_args = parse\n"
+        "parser = argparse.ArgumentParser\n"
+        "for name in ('parse_args', 'parse_intermixed_args'):\n"
+        "    def parse(self, *a, real=getattr(parser, name)):\n"
+        "        real(self, *a)\n"
+        "        sys.exit(0)\n"
+        "    setattr(parser, name, parse)\n"
         "sys.exit(main(sys.argv[1:]))\n"
     )
     done = subprocess.run(

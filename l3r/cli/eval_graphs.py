@@ -1,12 +1,12 @@
-"""``l3r eval graphs``.
+r"""``l3r eval graphs``.
 
-Run the full inference path on every graph of validation shards and print mean camera metrics,
-beside what all cameras at one place would score.
+Run the full inference path on every graph of validation shards and print mean
+camera metrics, beside what all cameras at one place would score.
 
 Examples::
 
   l3r eval graphs shards/val --checkpoint runs/room/model.ckpt
-  l3r eval graphs shards/val --untrained configs/base.yaml configs/model/tiny.yaml
+  l3r eval graphs shards/val --untrained configs/base.yaml
 """
 
 import argparse

@@ -1,7 +1,12 @@
-"""``l3r eval poses``: score cameras against trusted ones.
+"""``l3r eval poses``.
 
-Prints RRA, RTA and mAA in percent, and the error of the camera centres (ATE). Images are matched by
-name; the scales and frames of the two sides do not matter.
+Score cameras against trusted ones: RRA, RTA and mAA in percent, and the error
+of the camera centres (ATE). Images are matched by name; the scales and frames
+of the two sides do not matter.
+
+Examples::
+
+  l3r eval poses --pred out/ --gt scene/cameras.json --missing fail
 """
 
 import argparse
@@ -12,7 +17,6 @@ from pathlib import Path
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.epilog = "example: l3r eval poses --pred out/ --gt scene/cameras.json --missing fail"
     source = "cameras.json, the folder of one, or a COLMAP model"
     parser.add_argument("--pred", type=Path, required=True, metavar="OUT", help=source)
     parser.add_argument("--gt", type=Path, required=True, metavar="PATH", help=source)

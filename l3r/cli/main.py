@@ -29,11 +29,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = importlib.import_module(f"l3r.cli.{name.replace(' ', '_')}")
     parser = argparse.ArgumentParser(
         prog=f"l3r {name}",
-        description=str(command.__doc__).split("\n", 1)[1].strip(),
+        description=str(command.__doc__).split("\n", 1)[1].strip().replace("::", ":"),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     command.add_arguments(parser)
-    args = parser.parse_args(words[len(name.split()) :])
+    # Intermixed: settings may follow options.
+    args = parser.parse_intermixed_args(words[len(name.split()) :])
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     try:
         return int(command.run(args))

@@ -1,11 +1,13 @@
 """``l3r reconstruct``.
 
-Reconstruct a folder of photos: cameras, dense points and a report to look at. Writes into OUT:
-sparse/0 (COLMAP), points.ply, cameras.json, run.json and report.html.
+Reconstruct a folder of photos: cameras, dense points and a report to look at.
+Writes into OUT: sparse/0 (COLMAP), points.ply, cameras.json, run.json and
+report.html.
 
 Examples::
 
-  l3r reconstruct photos/ --checkpoint light3r.ckpt --out out/
+  l3r reconstruct photos/ --checkpoint l3r.ckpt --out out/
+  l3r reconstruct photos/ --checkpoint l3r.ckpt --out out/ inference.min_conf=5
 """
 
 import argparse

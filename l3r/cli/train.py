@@ -1,12 +1,13 @@
 r"""``l3r train``.
 
-Train on shards, or go on where the same run stopped. Writes into train.output_dir:
-config.yaml, metrics.csv, validation.csv, last.ckpt (to resume) and model.ckpt (weights).
+Train on shards, or go on where the same run stopped. Writes into
+train.output_dir: config.yaml, metrics.csv, validation.csv, last.ckpt (to go on)
+and model.ckpt (weights).
 
 Examples::
 
-  l3r train configs/base.yaml configs/model/tiny.yaml data.sources.room.shards=shards/train \
-      data.validation.room.shards=shards/val train.output_dir=runs/room
+  l3r train configs/base.yaml configs/model/tiny.yaml \
+      data.sources.room.shards=shards/train train.output_dir=runs/room
 """
 
 import argparse

@@ -1,0 +1,64 @@
+"""How fast pairs are related and graphs drawn, on a rendered room of 1,000 views of 48x48."""
+
+import time
+from functools import partial
+
+import torch
+
+from data_prep.converters.synthetic import intrinsics
+from data_prep.covisibility import build_table, prepare_views
+from data_prep.graph_sampling import sample_graphs
+from data_prep.raycast import render
+from data_prep.room import build_room, draw_cameras
+from data_prep.scene import Frame, Scene
+
+NUM_VIEWS = 1000
+NUM_GRAPHS = 2000
+SIZE = (48, 48)
+
+
+def run() -> list[tuple[str, str]]:
+    """Render, relate and draw once.
+
+    Returns:
+        Names and values of what was measured.
+    """
+    start = time.perf_counter()
+    scene = _render_scene()
+    rendered = time.perf_counter()
+    table = build_table(scene, prepare_views(scene))
+    related = time.perf_counter()
+    graphs = sample_graphs(table.iou.numpy(), table.score.numpy(), table.angle.numpy(), NUM_GRAPHS)
+    drawn = time.perf_counter()
+    return [
+        ("views rendered per second (48x48)", f"{NUM_VIEWS / (rendered - start):.0f}"),
+        ("pairs related per second (48x48)", f"{NUM_VIEWS**2 / (related - rendered):,.0f}"),
+        ("graphs drawn per second (1,000 views)", f"{len(graphs) / (drawn - related):,.0f}"),
+    ]
+
+
+def _render_scene() -> Scene:
+    room = build_room(0)
+    K = intrinsics(SIZE)
+    cameras = draw_cameras(room, NUM_VIEWS, seed=0)
+    frames = []
+    for start in range(0, NUM_VIEWS, 4):
+        chunk = cameras[start : start + 4]
+        image, depth = render(room, torch.from_numpy(K), chunk, SIZE)
+        for view in range(len(chunk)):
+            frames.append(
+                Frame(
+                    name=f"{start + view:06d}",
+                    image_size=SIZE,
+                    K=K,
+                    world_from_cam=chunk[view].numpy(),
+                    read_image=partial((image[view] * 255).byte().numpy),
+                    read_depth=partial(depth[view].numpy),
+                )
+            )
+    return Scene(dataset="synthetic", name="room", is_metric=True, frames=frames)
+
+
+if __name__ == "__main__":
+    for name, value in run():
+        print(f"{name}: {value}")

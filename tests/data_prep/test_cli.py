@@ -1,0 +1,99 @@
+import json
+import subprocess
+import sys
+
+import pytest
+
+from data_prep.cli import COMMANDS, main
+from l3r.data.schema import read_manifest
+from l3r.export.cameras_json import read_cameras
+
+
+def run(words):
+    return main(words.split())
+
+
+@pytest.mark.parametrize("command", list(COMMANDS))
+def test_every_command_explains_itself_with_an_example(command, capsys):
+    with pytest.raises(SystemExit, match="0"):
+        run(f"{command} --help")
+    text = capsys.readouterr().out
+    assert "example" in text
+    assert f"l3r-prep {command} " in text
+
+
+def test_help_lists_the_commands_without_importing_torch(capsys):
+    assert run("--help") == 0
+    text = capsys.readouterr().out
+    assert all(command in text for command in COMMANDS)
+    code = (
+        "import sys; from data_prep.cli import main\n"
+        "try: main(['build', '--help'])\nexcept SystemExit: pass\n"
+        "sys.exit('torch' in sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+
+
+def test_an_unknown_command_is_refused(capsys):
+    assert run("bild") == 2
+    assert "no command 'bild'" in capsys.readouterr().err
+
+
+def test_a_room_is_rendered_built_and_checked(tmp_path, capsys):
+    room = f"--raw {tmp_path}/raw --views 14 --held-out-views 12 --walk-views 3 --size 96x128"
+    graphs = "--num-graphs 4 --max-views 4 --min-views 3"
+    assert run(f"render {room}") == 0
+    assert run(f"build synthetic {room} --out {tmp_path}/out {graphs}") == 0
+    assert read_manifest(tmp_path / "out" / "train").num_graphs == 4
+    assert read_manifest(tmp_path / "out" / "val").num_graphs == 3
+    assert run(f"check {tmp_path}/out/train") == 0
+    out = capsys.readouterr().out
+    assert "room000" in out
+    assert "train: 4 graphs in 1 shards" in out
+    assert "val: 3 graphs" in out
+
+
+def test_the_last_frames_can_be_held_out(raw_room, tmp_path):
+    words = f"build tartanair --raw {raw_room} --scenes */P000 --out {tmp_path} --held-out 0.5"
+    assert run(f"{words} --num-graphs 4 --max-views 4 --min-views 3") == 0
+    files = {}
+    for part in ("train", "val"):
+        manifest = read_manifest(tmp_path / part)
+        assert manifest.request["source"]["held_out"] == 0.5
+        record = next((tmp_path / part / ".build").glob("*.scene.json"))
+        files[part] = json.loads(record.read_text())["fingerprint"]
+    assert files["train"] != files["val"]
+    assert read_manifest(tmp_path / "val").num_graphs == 2
+
+
+def test_true_cameras_of_one_scene_are_written(raw_room, room_scene, tmp_path):
+    words = f"cameras tartanair --raw {raw_room} --scenes */P002 --out {tmp_path}/c/cameras.json"
+    assert run(words) == 0
+    cameras = read_cameras(tmp_path / "c" / "cameras.json")
+    assert cameras.file == [f"{n:06d}_left.png" for n in range(6)]
+    assert cameras.registered.all()
+
+
+def test_cameras_of_several_scenes_are_refused(raw_room, tmp_path, capsys):
+    assert run(f"cameras tartanair --raw {raw_room} --out {tmp_path}/c.json") == 2
+    assert "3 scenes match" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("build tartanair --raw {t}/no --out {t}/o", "no pose_left.txt below"),
+        ("build tartanair --raw {t} --out {t}/o --views 3", "--views has no effect on tartanair"),
+        ("build synthetic --raw {t} --out {t}/o --split all", "--split has no effect"),
+        ("build synthetic --raw {t} --out {t}/o --size 48", "expected HEIGHTxWIDTH"),
+        ("build tartanair --raw {t} --out {t}/o --held-out 1", "expected a share"),
+        ("build tartanair --raw {t} --out {t}/o --max-views 1", "expected 2 <= min_views"),
+        ("check {t} --max-graphs 0", "expected 1 or more"),
+    ],
+)
+def test_a_user_error_is_one_line_and_exit_code_two(tmp_path, capsys, words, message):
+    assert run(words.format(t=tmp_path)) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert error.startswith(f"l3r-prep {words.split()[0]}: ")

@@ -1,0 +1,198 @@
+import math
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from data_prep.covisibility import (
+    build_table,
+    count_seen,
+    croco_score,
+    median_parallax,
+    prepare_views,
+)
+from data_prep.scene import Frame, Scene
+from l3r.errors import DataError
+
+
+@pytest.fixture(scope="module")
+def few(room_scene):
+    return replace(room_scene, frames=room_scene.frames[:6])
+
+
+@pytest.fixture(scope="module")
+def table(few):
+    return build_table(few, prepare_views(few))
+
+
+def grid_points(frame, stride):
+    """Known grid points of a frame, one by one: pixel, depth and world point."""
+    depth = frame.read_depth()
+    for row in range(stride // 2, depth.shape[0], stride):
+        for column in range(stride // 2, depth.shape[1], stride):
+            z = float(depth[row, column])
+            if z > 0:
+                ray = np.linalg.solve(frame.K, [column + 0.5, row + 0.5, 1.0])
+                yield (frame.world_from_cam @ [*(z * ray), 1.0])[:3]
+
+
+def is_seen(point, frame, depth):
+    x, y, z = (np.linalg.inv(frame.world_from_cam) @ [*point, 1.0])[:3]
+    if z <= 0:
+        return False
+    u, v, _ = frame.K @ [x / z, y / z, 1.0]
+    row, column = math.floor(v), math.floor(u)
+    if not (0 <= row < depth.shape[0] and 0 <= column < depth.shape[1]):
+        return False
+    found = float(depth[row, column])
+    return found > 0 and abs(found - z) <= max(0.05 * z, 0.05)
+
+
+def test_counts_equal_a_loop_over_points(few):
+    seen = count_seen(prepare_views(few))
+    depths = [frame.read_depth() for frame in few.frames]
+    for i in range(3):
+        points = list(grid_points(few.frames[i], stride=4))
+        for j, frame in enumerate(few.frames):
+            expected = sum(is_seen(point, frame, depths[j]) for point in points)
+            # Points within rounding of a pixel's edge may fall on either side.
+            assert abs(int(seen[i, j]) - expected) <= 0.002 * len(points)
+
+
+def test_the_table_follows_from_the_counts(few, table):
+    views = prepare_views(few)
+    seen, count = count_seen(views).double(), views.valid.sum(-1).double()
+    assert torch.equal(seen.diagonal(), count)
+    for i, j in ((0, 1), (2, 5), (4, 3)):
+        common = (seen[i, j] + seen[j, i]) / 2
+        assert table.iou[i, j].item() == pytest.approx(
+            (common / (count[i] + count[j] - common)).item(), abs=1e-6
+        )
+        assert table.covisible[i, j].item() == pytest.approx((seen[i, j] / count[i]).item())
+    assert torch.equal(table.iou, table.iou.T)
+    assert torch.equal(table.iou.diagonal(), torch.ones(6))
+
+
+def test_angles_equal_their_definitions(few, table):
+    for i, j in ((0, 1), (2, 5)):
+        Ri, Rj = (few.frames[k].world_from_cam[:3, :3] for k in (i, j))
+        rotation = math.acos((np.trace(Ri.T @ Rj) - 1) / 2)
+        axis = math.acos(Ri[:, 2] @ Rj[:, 2])
+        assert table.rotation[i, j].item() == pytest.approx(rotation, abs=1e-5)
+        assert table.axis[i, j].item() == pytest.approx(axis, abs=1e-5)
+
+
+def wall(offset, distance=4.0, size=(48, 64), metric_depth=None):
+    """A camera at a sideways offset in front of a wall."""
+    camera = np.eye(4)
+    camera[0, 3] = offset
+    depth = np.full(size, distance if metric_depth is None else metric_depth, np.float32)
+    K = np.array([[32.0, 0, 32], [0, 32, 24], [0, 0, 1]])
+    return Frame(
+        name=f"{offset}.png",
+        image_size=size,
+        K=K,
+        world_from_cam=camera,
+        read_image=partial(np.zeros, (*size, 3), np.uint8),
+        read_depth=lambda: depth,
+    )
+
+
+def wall_scene(*frames):
+    return Scene(dataset="toy", name="wall", is_metric=True, frames=list(frames))
+
+
+def test_a_shift_along_a_wall_overlaps_by_what_stays_in_view():
+    # The wall is 8 m wide in view: a shift of 2 m leaves 6 m, IoU 6 / 10.
+    scene = wall_scene(wall(0.0), wall(2.0), wall(20.0))
+    table = build_table(scene, prepare_views(scene))
+    assert table.covisible[0, 1].item() == pytest.approx(0.75)
+    assert table.iou[0, 1].item() == pytest.approx(0.6)
+    assert table.iou[0, 2].item() == 0
+
+
+def test_parallax_stands_in_where_nothing_turns():
+    scene = wall_scene(wall(0.0), wall(2.0))
+    views = prepare_views(scene)
+    (parallax,) = median_parallax(views, torch.tensor([[0, 1]]))
+    first, second = np.zeros(3), np.array([2.0, 0, 0])
+    common = [
+        point
+        for frame in scene.frames
+        for point in grid_points(frame, stride=4)
+        if -2 < point[0] < 4  # both see the wall from 2 m left of the first to 4 m right
+    ]
+    angles = [
+        math.acos(
+            (first - p) @ (second - p) / np.linalg.norm(first - p) / np.linalg.norm(second - p)
+        )
+        for p in common
+    ]
+    assert parallax.item() == pytest.approx(np.median(angles), abs=0.01)
+    table = build_table(scene, views)
+    assert table.rotation[0, 1].item() == pytest.approx(0, abs=1e-6)
+    assert table.angle[0, 1].item() == pytest.approx(parallax.item())
+    assert table.score[0, 1] > 0
+
+
+def test_parallax_of_pairs_without_common_points_is_nan():
+    scene = wall_scene(wall(0.0), wall(20.0))
+    assert median_parallax(prepare_views(scene), torch.tensor([[0, 1]])).isnan().all()
+
+
+def test_what_another_surface_hides_is_not_seen():
+    scene = wall_scene(wall(0.0), wall(1.0, metric_depth=2.0))
+    assert count_seen(prepare_views(scene))[0, 1] == 0
+
+
+def test_unknown_depth_counts_nowhere():
+    scene = wall_scene(wall(0.0), wall(0.5, metric_depth=0.0))
+    views = prepare_views(scene)
+    table = build_table(scene, views)
+    assert views.valid[1].sum() == 0
+    assert table.iou[0, 1] == 0
+    assert torch.isfinite(table.score).all()
+
+
+def test_far_from_the_origin_nothing_changes(few):
+    moved = []
+    for frame in few.frames:
+        camera = frame.world_from_cam.copy()
+        camera[:3, 3] += [4e5, -5e6, 100.0]
+        moved.append(replace(frame, world_from_cam=camera))
+    seen = count_seen(prepare_views(replace(few, frames=moved)))
+    assert (seen - count_seen(prepare_views(few))).abs().max() <= 2
+
+
+def test_images_of_several_sizes_are_refused():
+    scene = wall_scene(wall(0.0), wall(1.0, size=(24, 32)))
+    with pytest.raises(DataError, match="expected one size"):
+        prepare_views(scene)
+
+
+iou = st.floats(0, 1)
+angle = st.floats(0, math.pi)
+
+
+@given(iou, angle)
+def test_the_score_stays_between_zero_and_the_overlap(iou, angle):
+    score = croco_score(torch.tensor(iou), torch.tensor(angle)).item()
+    assert 0 <= score <= iou + 1e-6
+
+
+@given(iou)
+def test_the_score_is_the_overlap_at_sixty_degrees(iou):
+    score = croco_score(torch.tensor(iou), torch.tensor(math.radians(60)))
+    assert score.item() == pytest.approx(iou, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "value"), [(0, 0), (10, 0.060), (30, 0.464), (45, 0.828), (75, 0.767), (120, 0)]
+)
+def test_the_score_has_the_published_values(degrees, value):
+    score = croco_score(torch.tensor(1.0), torch.tensor(math.radians(degrees)))
+    assert score.item() == pytest.approx(value, abs=5e-4)
