@@ -37,7 +37,7 @@ def build_tree(scores: Float[Tensor, "b n n"], config: GraphConfig) -> SceneTree
         costs = sparsify(costs, config.knn)
     root = find_root(similarity)
     sum_costs = config.algorithm != "mst"
-    return order_edges(grow_tree(costs, root, sum_costs=sum_costs), costs, root)
+    return _order_edges(_grow_tree(costs, root, sum_costs=sum_costs), costs, root)
 
 
 def edge_costs(similarity: Float[np.ndarray, "b n n"], config: GraphConfig) -> np.ndarray:
@@ -74,14 +74,14 @@ def sparsify(costs: Float[np.ndarray, "b n n"], knn: int) -> np.ndarray:
     np.put_along_axis(kept, order, True, axis=-1)
     kept |= kept.transpose(0, 2, 1)
     kept &= np.isfinite(costs)
-    parent = grow_tree(np.where(kept, -1.0, costs), np.zeros(len(costs), int), sum_costs=False)
+    parent = _grow_tree(np.where(kept, -1.0, costs), np.zeros(len(costs), int), sum_costs=False)
     graph, child = np.nonzero(parent >= 0)
     kept[graph, child, parent[graph, child]] = True
     kept[graph, parent[graph, child], child] = True
     return np.where(kept, costs, np.inf)
 
 
-def grow_tree(
+def _grow_tree(
     costs: Float[np.ndarray, "b n n"], root: Int[np.ndarray, " b"], *, sum_costs: bool
 ) -> Int[np.ndarray, "b n"]:
     """Grow all trees of a batch from their roots, one view a round.
@@ -111,7 +111,7 @@ def grow_tree(
     return parent
 
 
-def order_edges(
+def _order_edges(
     parent_of: Int[np.ndarray, "b n"],
     costs: Float[np.ndarray, "b n n"],
     root: Int[np.ndarray, " b"],

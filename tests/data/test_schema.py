@@ -7,6 +7,7 @@ import pytest
 import webdataset
 
 from l3r.data import schema
+from l3r.data.schema.graph import check_cameras
 from l3r.errors import DataError
 
 VIEWS = 3
@@ -251,3 +252,19 @@ def test_a_manifest_that_cannot_be_used_is_refused(tmp_path, text, words):
         (tmp_path / schema.MANIFEST_NAME).write_text(text)
     with pytest.raises(DataError, match=words):
         schema.read_manifest(tmp_path)
+
+
+def test_usable_cameras_are_let_through():
+    sample = make_sample()
+    check_cameras(sample.K, sample.cam_from_world, "here")
+
+
+@pytest.mark.parametrize(
+    "change", [{(0, 0): 0.0}, {(1, 1): -30.0}, {(2, 2): 2.0}, {(0, 2): np.inf}]
+)
+def test_intrinsics_no_reader_could_use_are_refused(change):
+    sample = make_sample()
+    for (row, column), value in change.items():
+        sample.K[1, row, column] = value
+    with pytest.raises(DataError, match="here: image 01: K "):
+        check_cameras(sample.K, sample.cam_from_world, "here")

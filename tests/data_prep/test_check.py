@@ -92,7 +92,7 @@ def spoil_depth(trajectory):
 
 @pytest.mark.parametrize("spoil", [spoil_cameras, spoil_axes, spoil_depth])
 def test_a_mistake_in_the_source_does_not_pass_build_and_check(raw_room, tmp_path, spoil):
-    # The overlap is measured with the mistake in, so the sampler picks pairs that agree by accident.
+    # Overlap is measured with the mistake in: the sampler picks pairs that agree by accident.
     trajectory = tmp_path / "raw" / "room000" / "Easy" / "P000"
     shutil.copytree(raw_room / "room000" / "Easy" / "P000", trajectory)
     spoil(trajectory)

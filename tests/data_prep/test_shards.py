@@ -75,7 +75,6 @@ def test_two_builds_agree_byte_for_byte(room_shards, room_scene, tmp_path):
     assert digests(tmp_path) == digests(room_shards)
 
 
-@pytest.mark.slow
 def test_the_number_of_workers_changes_no_byte(room_shards, room_scene, tmp_path):
     build_shards([room_scene], tmp_path, BUILD, num_workers=2)
     assert digests(tmp_path) == digests(room_shards)
