@@ -12,12 +12,14 @@ NUM_WAVES = 3
 
 _CLEARANCE = 0.35
 """Least distance of a camera from any surface [m]."""
-_NUM_CURVES = 1024
-"""Curves tried for a walk."""
-_BEND = 0.98
-"""Least cosine between headings 1/256 of a walk apart: no cusps."""
-_HARMONICS = torch.arange(1, 4).float()
-"""Frequencies a walk is made of."""
+_MIDDLE = 0.3
+"""Share of the room that cameras look at, and stand around."""
+_NUM_RINGS = 256
+"""Rings tried for a walk."""
+_RING_FINE = 256
+"""Points at which a ring's clearance is measured."""
+_HARMONICS = torch.arange(2, 5).float()
+"""Frequencies of what bends a ring."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +58,7 @@ class Room:
         return 2 * self.half_size[0]
 
 
-def build_room(seed: int, *, num_boxes: int = 7, num_spheres: int = 4) -> Room:
+def build_room(seed: int, *, num_boxes: int = 4, num_spheres: int = 2) -> Room:
     """Draw a room; the same seed gives the same room.
 
     Args:
@@ -65,20 +67,20 @@ def build_room(seed: int, *, num_boxes: int = 7, num_spheres: int = 4) -> Room:
         num_spheres: Spheres in it.
     """
     draw = torch.Generator().manual_seed(seed)
-    half = torch.tensor([3.0, 2.5, 1.4]) + torch.rand(3, generator=draw) * torch.tensor(
-        [1.0, 1.0, 0.3]
+    half = torch.tensor([1.9, 1.6, 1.2]) + torch.rand(3, generator=draw) * torch.tensor(
+        [0.4, 0.4, 0.2]
     )
     world_from_box = torch.eye(4).repeat(num_boxes + 1, 1, 1)
     half_size = torch.tensor([0.2, 0.2, 0.2]) + torch.rand(
         num_boxes + 1, 3, generator=draw
-    ) * torch.tensor([0.45, 0.45, 0.65])
+    ) * torch.tensor([0.25, 0.25, 0.45])
     half_size[0] = half
     angle = torch.rand(num_boxes, generator=draw) * math.pi
     world_from_box[1:, :3, :3] = _turn_down(angle)
     spread = torch.rand(num_boxes, 2, generator=draw) * 2 - 1
     world_from_box[1:, :2, 3] = spread * (half[:2] - 0.4)
     world_from_box[:, 2, 3] = -half_size[:, 2]
-    radius = 0.25 + 0.35 * torch.rand(num_spheres, generator=draw)
+    radius = 0.25 + 0.15 * torch.rand(num_spheres, generator=draw)
     center = (torch.rand(num_spheres, 3, generator=draw) * 2 - 1) * (half - 0.7)
     center[:, 2] -= half[2]
     return Room(
@@ -106,7 +108,10 @@ def _draw_textures(num_surfaces: int, draw: torch.Generator) -> dict[str, Tensor
 
 
 def draw_cameras(room: Room, num_views: int, seed: int) -> Float[Tensor, "n 4 4"]:
-    """Draw cameras one by one: anywhere clear of the objects, towards anywhere, a little rolled.
+    """Draw cameras one by one, as a capture of a room has them: from around its middle, inwards.
+
+    Each stands anywhere outside the middle and clear of the objects, looks at a random point of
+    the middle, and is a little rolled.
 
     Args:
         room: The room, on the host.
@@ -119,10 +124,13 @@ def draw_cameras(room: Room, num_views: int, seed: int) -> Float[Tensor, "n 4 4"
     draw = torch.Generator().manual_seed(seed)
     position = torch.empty(0, 3)
     while len(position) < num_views:
-        candidate = _inside(room, torch.rand(4 * num_views, 3, generator=draw))
+        unit = torch.rand(8 * num_views, 3, generator=draw)
+        around = unit[(unit[:, :2] - 0.5).norm(dim=-1) > _MIDDLE]
+        candidate = _inside(room, around)
         position = torch.cat([position, candidate[clearance(room, candidate) > _CLEARANCE]])
     position = position[:num_views]
-    target = _inside(room, torch.rand(num_views, 3, generator=draw))
+    spread = _MIDDLE * (torch.rand(num_views, 3, generator=draw) - 0.5)
+    target = _inside(room, 0.5 + spread)
     # A target right above or below would leave the heading to chance.
     target[:, 2] = position[:, 2] + 0.5 * (target[:, 2] - position[:, 2])
     roll = 0.15 * torch.randn(num_views, generator=draw)
@@ -130,7 +138,7 @@ def draw_cameras(room: Room, num_views: int, seed: int) -> Float[Tensor, "n 4 4"
 
 
 def draw_walk(room: Room, num_views: int, seed: int) -> Float[Tensor, "n 4 4"]:
-    """Draw a smooth walk around the room, looking ahead and swaying from side to side.
+    """Draw a smooth walk once around the room, looking across it and swaying from side to side.
 
     Args:
         room: The room, on the host.
@@ -141,20 +149,20 @@ def draw_walk(room: Room, num_views: int, seed: int) -> Float[Tensor, "n 4 4"]:
         ``world_from_cam``, OpenCV camera axes, float64.
     """
     draw = torch.Generator().manual_seed(seed)
-    weight = torch.randn(_NUM_CURVES, 2, 3, 3, generator=draw) / _HARMONICS[:, None] ** 2
-    fine = _curve(room, weight, 256)
-    gap = clearance(room, fine.reshape(-1, 3)).reshape(_NUM_CURVES, -1).amin(1)
-    ahead = torch.nn.functional.normalize((fine.roll(-1, 1) - fine)[..., :2], dim=-1)
-    bend = (ahead * ahead.roll(-1, 1)).sum(-1).amin(1)
-    good = ((gap > _CLEARANCE) & (bend > _BEND)).int()
-    chosen = int(good.argmax() if good.any() else (gap + bend).argmax())
-    position = _curve(room, weight[chosen : chosen + 1], num_views)[0]
-    time = _loop(num_views)
-    along = _curve(room, weight[chosen : chosen + 1], 16 * num_views)[0]
-    step = (along.roll(-1, 0) - along.roll(1, 0))[::16]
-    heading = torch.atan2(step[:, 1], step[:, 0]) + 0.6 * torch.sin(3 * time)
-    forward = torch.stack([heading.cos(), heading.sin(), 0.15 + 0.1 * torch.sin(2 * time)], dim=-1)
-    roll = 0.05 * torch.sin(5 * time)
+    radius = 0.25 + 0.15 * torch.rand(_NUM_RINGS, generator=draw)
+    bends = 0.03 * torch.randn(_NUM_RINGS, 2, 3, 3, generator=draw)
+    fine = _ring(room, radius, bends, _RING_FINE)
+    gap = clearance(room, fine.reshape(-1, 3)).reshape(_NUM_RINGS, -1).amin(1)
+    clear = (gap > _CLEARANCE).int()
+    chosen = int(clear.argmax() if clear.any() else gap.argmax())
+    position = _ring(room, radius[chosen, None], bends[chosen, None], num_views)[0]
+    angle = _loop(num_views)
+    sway = 0.5 + 0.2 * _MIDDLE * torch.stack(
+        [torch.sin(3 * angle), torch.cos(2 * angle), torch.sin(2 * angle)], dim=-1
+    )
+    forward = _inside(room, sway) - position
+    forward[:, 2] *= 0.5
+    roll = 0.05 * torch.sin(5 * angle)
     return _look(position.double(), forward.double(), roll.double())
 
 
@@ -163,11 +171,15 @@ def _loop(num_views: int) -> Float[Tensor, " n"]:
     return torch.arange(num_views) * (2 * math.pi / max(num_views, 1))
 
 
-def _curve(room: Room, weight: Float[Tensor, "c 2 3 3"], num_views: int) -> Float[Tensor, "c n 3"]:
-    """Evaluate closed curves of three harmonics within the room."""
-    angle = _loop(num_views)[:, None] * _HARMONICS
-    wave = torch.stack([angle.cos(), angle.sin()])
-    return _inside(room, 0.5 + 0.2 * torch.einsum("pth,cphx->ctx", wave, weight))
+def _ring(
+    room: Room, radius: Float[Tensor, " c"], bends: Float[Tensor, "c 2 3 3"], num_views: int
+) -> Float[Tensor, "c n 3"]:
+    """Evaluate bent rings around the room's middle; ``radius`` is a share of the room."""
+    angle = _loop(num_views)
+    ring = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], dim=-1)
+    wave = torch.stack([(angle[:, None] * _HARMONICS).cos(), (angle[:, None] * _HARMONICS).sin()])
+    bent = torch.einsum("pth,cphx->ctx", wave, bends)
+    return _inside(room, 0.5 + radius[:, None, None] * ring + bent)
 
 
 def clearance(room: Room, pts3d_world: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:

@@ -19,11 +19,12 @@ stage() { # name, command...: show it, run it, note its seconds
 : >"$OUT/seconds.txt"
 
 # 1. Raw frames in TartanAir's layout: P000 to train on, P001 held out, P002 a walk to reconstruct.
-stage render l3r-prep render --raw "$OUT/raw" --views 3000 --held-out-views 300 --walk-views 200
+stage render l3r-prep render --raw "$OUT/raw" --views 3000 --held-out-views 300 --walk-views 200 \
+    --size 40x40
 
 # 2. Shards of 8-image graphs, through the TartanAir converter.
 stage shards l3r-prep build synthetic --raw "$OUT/raw" --out "$OUT/shards" \
-    --num-graphs 4000 --max-views 8 --workers 1
+    --num-graphs 4000 --max-views 8 --size 40x40
 stage check l3r-prep check "$OUT/shards/train"
 
 # 3. Training from scratch, a fixed number of steps.
@@ -38,7 +39,7 @@ stage untrained l3r eval graphs "$OUT/shards/val" --max-graphs 64 --json "$OUT/u
 
 # 5. Every tenth frame of the walk becomes a reconstruction, scored against the true cameras.
 mkdir -p "$OUT/photos"
-cp "$ROOM"/P002/image_left/00???0_left.png "$OUT/photos"
+cp "$ROOM"/P002/image_left/000??0_left.png "$OUT/photos"
 stage reconstruct l3r reconstruct "$OUT/photos" --checkpoint "$OUT/tiny.ckpt" \
     --out "$OUT/reconstruction"
 l3r-prep cameras tartanair --raw "$OUT/raw" --scenes '*/P002' --frame-step 10 \

@@ -28,11 +28,16 @@ def main(folder: Path) -> None:
     out(f"\n{trained['num_graphs']} held-out graphs of 8 images, cameras never seen in training\n")
     out(f"{'':<12}" + "".join(f"{key:>9}" for key in SHOWN) + "\n")
     for name, values in metrics.items():
-        cells = [f"{values[key]:>9.{3 if key == 'ate' else 1}f}" for key in SHOWN]
-        out(f"{name:<12}" + "".join(cells) + "\n")
+        out(f"{name:<12}" + "".join(_cell(key, values[key]) for key in SHOWN) + "\n")
     out("percent, but for ate (lower is better)\n\n")
     out("seconds: " + ", ".join(f"{name} {value}" for name, value in seconds.items()) + "\n")
     out(f"metrics: {folder / 'metrics.json'}   look at {folder / 'reconstruction/report.html'}\n")
+
+
+def _cell(key: str, value: float | None) -> str:
+    if value is None:
+        return f"{'-':>9}"
+    return f"{value:>9.{3 if key == 'ate' else 1}f}"
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """A network on validation shards, by the full inference path."""
 
 import json
+import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,14 +52,19 @@ class GraphScores:
     def write_json(self, path: Path) -> None:
         """Write all metrics."""
         plain = {
-            "network": self.network.to_dict(),
-            "identity": self.identity.to_dict(),
+            "network": _without_nan(self.network),
+            "identity": _without_nan(self.identity),
             "num_graphs": self.num_graphs,
             "num_views": self.num_views,
             "seconds": self.seconds,
             "missing": "fail",
         }
-        write_atomic(path, (json.dumps(plain, indent=2) + "\n").encode())
+        write_atomic(path, (json.dumps(plain, indent=2, allow_nan=False) + "\n").encode())
+
+
+def _without_nan(metrics: CameraMetrics) -> dict[str, float | None]:
+    """JSON has no NaN: what is undefined becomes null."""
+    return {key: None if math.isnan(x) else x for key, x in metrics.to_dict().items()}
 
 
 def evaluate_shards(
