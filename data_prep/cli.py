@@ -40,6 +40,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except L3RError as error:
         sys.stderr.write(f"l3r-prep {name}: {error}\n")
         return 2
+    except OSError as error:
+        sys.stderr.write(f"l3r-prep {name}: {error}; check the path and its permissions\n")
+        return 2
     except KeyboardInterrupt:
         sys.stderr.write(f"l3r-prep {name}: interrupted; run it again to go on\n")
         return 130

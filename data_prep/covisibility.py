@@ -76,8 +76,8 @@ class OverlapTable:
 def prepare_views(scene: Scene, device: torch.device | str = "cpu") -> DepthViews:
     """Read a scene's depth once, thinned to what the overlap needs.
 
-    Depth to compare with keeps at most 320 columns; the grid has 64, but at least every fourth
-    column is left out.
+    Depth to compare with keeps at most 320 columns; the grid has 64, but never more than every
+    fourth column.
 
     Args:
         scene: Frames of one image size.

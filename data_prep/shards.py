@@ -5,7 +5,6 @@ on nothing but the request and the source, so two builds agree byte for byte.
 """
 
 import hashlib
-import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field
@@ -27,12 +26,14 @@ from l3r.data.schema import (
     GraphSample,
     Manifest,
     ShardEntry,
+    ShardIndex,
     encode_graph,
     index_shard,
     write_index,
     write_manifest,
 )
 from l3r.errors import DataError
+from l3r.files import atomic_path
 from l3r.geometry.rigid import invert_rigid
 
 
@@ -167,22 +168,26 @@ def write_shard(path: Path, cache: FrameCache, plans: list[GraphPlan]) -> ShardE
     Raises:
         DataError: A frame cannot be read or stored.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with temporary.open("wb") as stream:
-        with webdataset.TarWriter(stream, encoder=False, mtime=0) as writer:
-            for plan in plans:
-                members = encode_graph(_graph_sample(cache, plan), plan.key)
-                # One by one, since a whole sample would be written in alphabetical order.
-                for name, data in list(members.items())[1:]:
-                    writer.write({"__key__": plan.key, name: data})
-        stream.flush()
-        os.fsync(stream.fileno())
-    with temporary.open("rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    index = index_shard(temporary)
-    temporary.replace(path)
+    with atomic_path(path) as temporary:
+        index, digest = _write_tar(temporary, cache, plans)
     write_index(path, index)
     return ShardEntry(name=path.name, num_graphs=len(plans), bytes=index.tar_bytes, sha256=digest)
+
+
+def _write_tar(path: Path, cache: FrameCache, plans: list[GraphPlan]) -> tuple[ShardIndex, str]:
+    """Write a tar; give its index and its digest."""
+    with (
+        path.open("wb") as stream,
+        webdataset.TarWriter(stream, encoder=False, mtime=0) as writer,
+    ):
+        for plan in plans:
+            members = encode_graph(_graph_sample(cache, plan), plan.key)
+            # One by one, since a whole sample would be written in alphabetical order.
+            for name, data in list(members.items())[1:]:
+                writer.write({"__key__": plan.key, name: data})
+    with path.open("rb") as stream:
+        digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    return index_shard(path), digest
 
 
 def _graph_sample(cache: FrameCache, plan: GraphPlan) -> GraphSample:

@@ -9,14 +9,13 @@ OUT=runs/demo
 ROOM=$OUT/raw/room000/Easy
 mkdir -p "$OUT"
 
-stage() { # name, command...: show it, run it, note its seconds
+stage() { # name, command...: show it, run it, note its seconds (a resumed stage adds up)
     local name=$1 began=$SECONDS
     shift
     printf '\n\033[1m%s\033[0m: %s\n' "$name" "$*"
     "$@"
     echo "$name $((SECONDS - began))" >>"$OUT/seconds.txt"
 }
-: >"$OUT/seconds.txt"
 
 # 1. Raw frames in TartanAir's layout: P000 to train on, P001 held out, P002 a walk to reconstruct.
 stage render l3r-prep render --raw "$OUT/raw" --views 3000 --held-out-views 300 --walk-views 200 \

@@ -18,8 +18,10 @@ def main(folder: Path) -> None:
         "identity": trained["identity"],
         "trained": trained["network"],
     }
-    stages = [line.split() for line in (folder / "seconds.txt").read_text().splitlines()]
-    seconds = {name: int(value) for name, value in stages}
+    seconds: dict[str, int] = {}
+    for line in (folder / "seconds.txt").read_text().splitlines():
+        name, value = line.split()
+        seconds[name] = seconds.get(name, 0) + int(value)
     metrics = {name: {key: values[key] for key in SHOWN} for name, values in rows.items()}
     content = {**metrics, "num_graphs": trained["num_graphs"], "seconds": seconds}
     write_atomic(folder / "metrics.json", json.dumps(content, indent=2) + "\n")

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from data_prep.commands.room_options import ROOM_DEFAULTS, add_room_arguments, room_request
+from data_prep.converters import CONVERTERS, read_scenes
 from l3r.errors import DataError
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ _RAW_DEFAULTS: dict[str, Any] = {"scenes": "*", "split": "train", "frame_step": 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments; an option of one source alone has no default here."""
     add = parser.add_argument
-    add("dataset", choices=["tartanair", "synthetic"], help="what to read")
+    add("dataset", choices=[*sorted(CONVERTERS), "synthetic"], help="what to read")
     add(
         "--raw",
         type=Path,
@@ -42,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--min-views", type=int, metavar="N", help="fewest images of a graph (8, or --max-views)")
     add("--seed", type=int, default=0, metavar="N", help="seed of the draw (0)")
     add("--workers", type=int, default=0, metavar="N", help="processes that encode (0: this one)")
-    raw = parser.add_argument_group("tartanair")
+    raw = parser.add_argument_group("raw data sets")
     raw.add_argument("--scenes", metavar="GLOB", help="pattern on ENV/LEVEL/PNNN (*)")
     raw.add_argument(
         "--split",
@@ -69,14 +70,14 @@ def run(args: argparse.Namespace) -> int:
 
     use_one_thread()
     _refuse_foreign(args)
-    parts = _tartanair_parts(args) if args.dataset == "tartanair" else _synthetic_parts(args)
+    parts = _synthetic_parts(args) if args.dataset == "synthetic" else _raw_parts(args)
     for folder, scenes, num_graphs, source in parts:
         sys.stdout.write(_build(args, folder, scenes, num_graphs, source))
     return 0
 
 
 def _refuse_foreign(args: argparse.Namespace) -> None:
-    foreign = list(ROOM_DEFAULTS) if args.dataset == "tartanair" else list(_RAW_DEFAULTS)
+    foreign = list(_RAW_DEFAULTS) if args.dataset == "synthetic" else list(ROOM_DEFAULTS)
     for key in foreign:
         if getattr(args, key) is not None:
             raise DataError(
@@ -88,8 +89,7 @@ Part = tuple[Path, Iterable["Scene"], int, dict[str, Any]]
 """Folder of shards, what goes in, graphs of each scene, options to record."""
 
 
-def _tartanair_parts(args: argparse.Namespace) -> list[Part]:
-    from data_prep.converters import tartanair
+def _raw_parts(args: argparse.Namespace) -> list[Part]:
     from data_prep.plan import hold_out
 
     source = {
@@ -104,8 +104,12 @@ def _tartanair_parts(args: argparse.Namespace) -> list[Part]:
         )
 
     def read() -> Iterable["Scene"]:
-        return tartanair.read(
-            args.raw, source["split"], scenes=source["scenes"], frame_step=source["frame_step"]
+        return read_scenes(
+            args.dataset,
+            args.raw,
+            source["split"],
+            scenes=source["scenes"],
+            frame_step=source["frame_step"],
         )
 
     if not share:

@@ -9,13 +9,14 @@ import argparse
 import sys
 from pathlib import Path
 
+from data_prep.converters import CONVERTERS, read_scenes
 from l3r.errors import DataError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     add = parser.add_argument
-    add("dataset", choices=["tartanair"], help="layout of the source")
+    add("dataset", choices=sorted(CONVERTERS), help="layout of the source")
     add("--raw", type=Path, required=True, metavar="DIR", help="folder of the raw data")
     add("--scenes", default="*", metavar="GLOB", help="the scene, as ENV/LEVEL/PNNN; must be one")
     add("--frame-step", type=int, default=1, metavar="N", help="take every so many frames (1)")
@@ -26,12 +27,13 @@ def run(args: argparse.Namespace) -> int:
     """Write the cameras and print how many."""
     import torch
 
-    from data_prep.converters import tartanair
     from l3r.export.cameras_json import write_cameras
     from l3r.geometry.rigid import invert_rigid
     from l3r.types import Cameras
 
-    found = tartanair.read(args.raw, "all", scenes=args.scenes, frame_step=args.frame_step)
+    found = read_scenes(
+        args.dataset, args.raw, "all", scenes=args.scenes, frame_step=args.frame_step
+    )
     scenes = list(found)
     if len(scenes) > 1:
         names = ", ".join(scene.name for scene in scenes[:3])

@@ -39,22 +39,17 @@ def run(args: argparse.Namespace) -> int:
     from l3r.files import write_atomic
 
     result = evaluate_cameras(load_cameras(args.pred), load_cameras(args.gt), args.missing)
-    m = result.metrics
-    table = Table()
-    for heading in ("", "5 deg", "15 deg", "30 deg", "mAA@30"):
-        table.add_column(heading, justify="right" if heading else "left")
-    one = "{:.1f}".format
-    table.add_row("RRA %", *map(one, (m.rra_5, m.rra_15, m.rra_30)), "")
-    table.add_row("RTA %", *map(one, (m.rta_5, m.rta_15, m.rta_30)), one(m.maa_30))
-    signed = (m.rta_5_signed, m.rta_15_signed, m.rta_30_signed, m.maa_30_signed)
-    table.add_row("RTA % signed", *map(one, signed))
-    table.add_row("min(RRA, RTA)", "", "", "", one(m.maa_30_min))
+    table = Table("metric", "value")
+    table.columns[1].justify = "right"
+    for name, value in result.metrics.to_dict().items():
+        is_length = name.startswith("ate")
+        table.add_row(name, f"{value:.4g}" if is_length else f"{value:.1f} %")
     console = Console(file=sys.stdout, width=80, highlight=False, markup=False)
     console.print(f"{args.pred} against {args.gt}")
     console.print(table)
-    console.print(f"ATE {m.ate:.5f} normalised, {m.ate_rmse:.4g} RMSE in units of the truth")
+    console.print("ate: normalised; ate_rmse: in units of the truth")
     console.print(
-        f"registered {result.num_registered} of {result.num_images} images ({m.reg:.1f} %), "
+        f"registered {result.num_registered} of {result.num_images} images, "
         f"{result.num_images - result.num_found} not in the prediction"
     )
     console.print(f"missing: {result.missing}; near-coincident true pairs: {result.num_short}")

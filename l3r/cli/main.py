@@ -41,6 +41,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except L3RError as error:
         sys.stderr.write(f"l3r {name}: {error}\n")
         return 2
+    except OSError as error:
+        sys.stderr.write(f"l3r {name}: {error}; check the path and its permissions\n")
+        return 2
     except KeyboardInterrupt:
         sys.stderr.write(f"l3r {name}: interrupted\n")
         return 130

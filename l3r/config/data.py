@@ -13,10 +13,19 @@ class SourceConfig:
     """Folder that holds ``manifest.json`` and the tars."""
     weight: float = 1.0
     """Relative frequency of its graphs."""
+    span: list[float] = field(default_factory=lambda: [0.0, 1.0])
+    """[first, last] share of its graphs, in stored order: [0, 0.9] trains, [0.9, 1] is held out."""
 
     def __post_init__(self) -> None:
         """Check ranges."""
         require(self.weight > 0, "data.sources.*.weight", self.weight, "more than 0")
+        span = self.span
+        require(
+            len(span) == 2 and 0 <= span[0] < span[1] <= 1,
+            "data.*.span",
+            span,
+            "[first, last], rising, from 0 to 1",
+        )
 
 
 @dataclass(kw_only=True, slots=True)

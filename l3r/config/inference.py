@@ -35,6 +35,7 @@ class InferenceConfig:
             require(getattr(self, key) >= 1, f"inference.{key}", getattr(self, key), "1 or more")
         for key in ("min_points", "pnp_points"):
             require(getattr(self, key) >= 4, f"inference.{key}", getattr(self, key), "4 or more")
+        require(self.min_conf >= 0, "inference.min_conf", self.min_conf, "0 or more")
         share = self.fallback_share
         require(0 <= share <= 1, "inference.fallback_share", share, "0 to 1")
         require(self.pnp_error > 0, "inference.pnp_error", self.pnp_error, "more than 0")

@@ -42,8 +42,8 @@ class TrainConfig:
     """Graphs of each validation."""
     log_every: int = 50
     """Steps between rows of ``metrics.csv``."""
-    accelerator: str = "auto"
-    """``auto``, ``cpu`` or ``gpu``."""
+    accelerator: Literal["auto", "cpu", "gpu"] = "auto"
+    """Where to train; ``auto`` takes a GPU if there is one."""
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -58,6 +58,8 @@ class TrainConfig:
         for key in ("warmup_steps", "weight_decay", "validation_graphs", "min_lr_ratio"):
             require(getattr(self, key) >= 0, f"train.{key}", getattr(self, key), "0 or more")
         require(self.lr > 0, "train.lr", self.lr, "more than 0")
-        require(len(self.betas) == 2, "train.betas", self.betas, "two numbers")
+        betas = self.betas
+        in_range = len(betas) == 2 and all(0 <= beta < 1 for beta in betas)
+        require(in_range, "train.betas", betas, "two numbers from 0 to less than 1")
         clip = self.clip_norm
         require(clip is None or clip > 0, "train.clip_norm", clip, "null or more than 0")

@@ -16,13 +16,15 @@ from torch.utils.data import DataLoader, Dataset
 from l3r.config import DataConfig, SourceConfig
 from l3r.data.sampling import SampleChooser
 from l3r.data.source import ShardFolder
-from l3r.data.stages import KeyedGraph, collate, resize_crop, to_views
+from l3r.data.stages import collate, resize_crop, to_views
 from l3r.errors import ConfigError, DataError
 from l3r.types import Views
 
 log = logging.getLogger(__name__)
 
 LOG_SKIP_EVERY = 100
+MAX_ATTEMPTS = 20
+"""Unreadable graphs in a row after which the source is given up."""
 MIN_READ_BEFORE_STOP = 200
 """A skip rate over fewer reads says little."""
 
@@ -39,13 +41,15 @@ class DeviceShare:
 class StepBatch:
     """What a worker sends: the batch and what it had to leave out."""
 
-    views: Views
+    views: Views | None
+    """The batch; None where no sample of a source could be read."""
     skipped: list[str]
     """One line for each unreadable sample, which another of the same source replaced."""
 
     def pin_memory(self) -> "StepBatch":
         """Pin the batch's tensors."""
-        return StepBatch(views=self.views.pin_memory(), skipped=self.skipped)
+        pinned = None if self.views is None else self.views.pin_memory()
+        return StepBatch(views=pinned, skipped=self.skipped)
 
 
 class StepDataset(Dataset[StepBatch]):
@@ -73,21 +77,15 @@ class StepDataset(Dataset[StepBatch]):
     def __getitem__(self, step: int) -> StepBatch:
         """Read this device's graphs of a step."""
         skipped: list[str] = []
-        graphs = [self._read(step, slot, skipped) for slot in self.slots]
-        views = collate(list(to_views(resize_crop(graphs, image_size=self.image_size))))
-        return StepBatch(views=views, skipped=skipped)
-
-    def _read(self, step: int, slot: int, skipped: list[str]) -> KeyedGraph:
-        """Read a slot's graph; the next ones of its source stand in for an unreadable one."""
-        source, first = self.chooser.choose(step, slot)
-        folder = self.folders[source]
-        for attempt in range(len(folder)):
-            index = (first + attempt) % len(folder)
-            try:
-                return folder.read(index)
-            except DataError as error:
-                skipped.append(f"{folder.key(index)}: {error}")
-        raise DataError(f"no graph of source {folder.dataset} can be read; last: {skipped[-1]}")
+        graphs: list[Views] = []
+        for slot in self.slots:
+            source, first = self.chooser.choose(step, slot)
+            views = read_or_next(self.folders[source], first, self.image_size, skipped)
+            if views is None:
+                # Not raised here: an error that leaves a worker arrives as a traceback.
+                return StepBatch(views=None, skipped=skipped)
+            graphs.append(views)
+        return StepBatch(views=collate(graphs), skipped=skipped)
 
 
 class StepLoader:
@@ -129,6 +127,11 @@ class StepLoader:
         )
         for batch in loader:
             self._count(batch)
+            if batch.views is None:
+                raise DataError(
+                    f"{MAX_ATTEMPTS} graphs in a row cannot be read; last: {batch.skipped[-1]}; "
+                    "check that the folder of shards is there, and run 'l3r-prep check' on it"
+                )
             self.step += 1
             yield batch.views
 
@@ -141,7 +144,7 @@ class StepLoader:
         self.step = int(state["step"])
 
     def _count(self, batch: StepBatch) -> None:
-        self.num_read += len(batch.views.key) + len(batch.skipped)
+        self.num_read += len(self.dataset.slots) + len(batch.skipped)
         for line in batch.skipped:
             if self.num_skipped % LOG_SKIP_EVERY == 0:
                 log.warning("sample skipped (%d so far): %s", self.num_skipped + 1, line)
@@ -161,7 +164,10 @@ def open_folders(sources: dict[str, SourceConfig], num_views: int) -> list[Shard
     Raises:
         DataError: A folder holds no finished shards.
     """
-    return [ShardFolder(Path(source.shards), num_views) for source in sources.values()]
+    return [
+        ShardFolder(Path(source.shards), num_views, (source.span[0], source.span[1]))
+        for source in sources.values()
+    ]
 
 
 def build_training_loader(
@@ -193,8 +199,31 @@ def build_training_loader(
     return StepLoader(dataset, config, num_steps, pin_memory=torch.cuda.is_available())
 
 
+def read_or_next(
+    folder: ShardFolder, index: int, image_size: tuple[int, int], skipped: list[str]
+) -> Views | None:
+    """Read a graph as a batch of one; the next ones stand in for an unreadable one.
+
+    Args:
+        folder: Where it is.
+        index: Which one.
+        image_size: (height, width).
+        skipped: Receives a line for each unreadable one.
+
+    Returns:
+        None where ``MAX_ATTEMPTS`` in a row cannot be read.
+    """
+    for attempt in range(min(MAX_ATTEMPTS, len(folder))):
+        current = (index + attempt) % len(folder)
+        try:
+            return read_graph(folder, current, image_size)
+        except DataError as error:
+            skipped.append(f"{folder.key(current)}: {error}")
+    return None
+
+
 def read_graph(folder: ShardFolder, index: int, image_size: tuple[int, int]) -> Views:
-    """Read one graph as a batch of one, for validation.
+    """Read one graph as a batch of one.
 
     Raises:
         DataError: The graph cannot be read.

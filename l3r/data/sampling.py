@@ -12,8 +12,9 @@ class SampleChooser:
     """Choose a source and a graph for each global slot of each step.
 
     The choice depends on (seed, step, global slot) and on nothing else: another number of devices
-    or workers sees the same samples, and no state must be kept but the step. Each source runs
-    through a permutation of its graphs before any comes again.
+    or workers sees the same samples, and no state must be kept but the step. A source alone runs
+    through a permutation of its graphs before any comes again; of several, each uses those parts
+    of its permutations that its slots fall on.
 
     Args:
         sizes: Graphs of each source.

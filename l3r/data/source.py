@@ -14,24 +14,30 @@ class ShardFolder:
     Args:
         folder: Holds ``manifest.json`` and the tars.
         num_views: Graphs with fewer images are left out.
+        span: (first, last) share of the others that is taken, in stored order.
 
     Raises:
         DataError: The folder holds no finished shards, or no graph of so many images.
     """
 
-    def __init__(self, folder: Path, num_views: int) -> None:
+    def __init__(
+        self, folder: Path, num_views: int, span: tuple[float, float] = (0.0, 1.0)
+    ) -> None:
         self.num_views = num_views
-        self.dataset = read_manifest(folder).dataset
-        self.entries: list[tuple[Path, IndexEntry]] = [
+        manifest = read_manifest(folder)
+        self.dataset = manifest.dataset
+        stored: list[tuple[Path, IndexEntry]] = [
             (folder / shard.name, entry)
-            for shard in read_manifest(folder).shards
+            for shard in manifest.shards
             for entry in load_index(folder / shard.name).graphs
             if entry.num_views >= num_views
         ]
+        first, last = (round(share * len(stored)) for share in span)
+        self.entries = stored[first:last]
         if not self.entries:
             raise DataError(
-                f"{folder}: no graph of {num_views} images; lower data.num_views or build the "
-                "shards with a larger --max-views"
+                f"{folder}: no graph of {num_views} images in the span {list(span)}; lower "
+                "data.num_views or build the shards with a larger --max-views"
             )
 
     def __len__(self) -> int:

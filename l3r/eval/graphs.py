@@ -1,7 +1,6 @@
 """A network on validation shards, by the full inference path."""
 
 import json
-import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,14 +10,13 @@ from rich.console import Console
 from rich.progress import track
 
 from l3r.config import InferenceConfig
+from l3r.config.check import require
 from l3r.data.loader import read_graph
 from l3r.data.source import ShardFolder
 from l3r.files import write_atomic
 from l3r.inference.reconstruct import reconstruct_views
 from l3r.metrics.cameras import CameraMetrics, camera_metrics, mean_metrics
 from l3r.model.light3r import Light3R
-
-SHOWN = ("rra_5", "rra_15", "rta_5", "rta_15", "maa_30", "ate", "reg")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,32 +37,25 @@ class GraphScores:
     def to_table(self) -> str:
         """Lay out as a table of at most 80 columns."""
         rows = [f"{self.num_graphs} graphs of {self.num_views} images, {self.seconds:.1f} s"]
-        rows.append("            " + "".join(f"{name:>9}" for name in SHOWN))
-        for name, metrics in (("network", self.network), ("identity", self.identity)):
-            values = metrics.to_dict()
-            cells = [
-                f"{values[key]:>9.4f}" if key == "ate" else f"{values[key]:>9.1f}" for key in SHOWN
-            ]
-            rows.append(f"{name:<12}" + "".join(cells))
+        rows.append(f"{'':<16}{'network':>10}{'identity':>10}")
+        identity = self.identity.to_dict()
+        for name, value in self.network.to_dict().items():
+            digits = 4 if name.startswith("ate") else 1
+            rows.append(f"{name:<16}{value:>10.{digits}f}{identity[name]:>10.{digits}f}")
         rows.append("percent, but for ate; pairs of unregistered images count as failed")
         return "\n".join(rows) + "\n"
 
     def write_json(self, path: Path) -> None:
         """Write all metrics."""
         plain = {
-            "network": _without_nan(self.network),
-            "identity": _without_nan(self.identity),
+            "network": self.network.to_plain(),
+            "identity": self.identity.to_plain(),
             "num_graphs": self.num_graphs,
             "num_views": self.num_views,
             "seconds": self.seconds,
             "missing": "fail",
         }
         write_atomic(path, (json.dumps(plain, indent=2, allow_nan=False) + "\n").encode())
-
-
-def _without_nan(metrics: CameraMetrics) -> dict[str, float | None]:
-    """JSON has no NaN: what is undefined becomes null."""
-    return {key: None if math.isnan(x) else x for key, x in metrics.to_dict().items()}
 
 
 def evaluate_shards(
@@ -86,7 +77,10 @@ def evaluate_shards(
 
     Raises:
         DataError: The shards cannot be read.
+        ConfigError: ``max_graphs`` or ``num_views`` is too small.
     """
+    require(num_views >= 2, "--num-views", num_views, "2 or more")
+    require(max_graphs is None or max_graphs >= 1, "--max-graphs", max_graphs, "1 or more")
     shards = ShardFolder(folder, num_views)
     count = len(shards) if max_graphs is None else min(max_graphs, len(shards))
     size = (model.config.image_size[0], model.config.image_size[1])

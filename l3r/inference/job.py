@@ -63,7 +63,7 @@ def reconstruct_folder(
     """
     began = time.perf_counter()
     check_output(out)
-    files = find_photos(photos)
+    files = find_photos(photos, besides=out)
     clock = StageClock(choose_device(device))
     with clock.stage("model"):
         model, config = load_model_and_config(checkpoint, clock.device, settings)

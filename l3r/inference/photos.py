@@ -38,18 +38,24 @@ class LoadedPhotos:
     """JPEGs of photos that an EXIF flag turns, as they are shown, by file."""
 
 
-def find_photos(folder: Path) -> list[Path]:
+def find_photos(folder: Path, besides: Path | None = None) -> list[Path]:
     """List the images of a folder and its sub-folders by name; hidden files are left out.
+
+    Args:
+        folder: Where to look.
+        besides: A folder to leave out, such as where a reconstruction is written.
 
     Raises:
         DataError: The folder does not exist.
     """
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder; expected a folder of photos")
+    skipped = besides.resolve() if besides else None
     return sorted(
         path
         for path in folder.rglob("*")
-        if path.suffix.lower() in SUFFIXES
+        if skipped not in path.resolve().parents
+        and path.suffix.lower() in SUFFIXES
         and not any(part.startswith(".") for part in path.relative_to(folder).parts)
     )
 
@@ -150,7 +156,7 @@ def _to_rgb(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
 
 def _scaled(image: UInt8[np.ndarray, "h w 3"], config: ModelConfig) -> torch.Tensor:
     height, width = network_size(image.shape[0], image.shape[1], config)
-    shrinks = height < image.shape[0]
+    shrinks = height < image.shape[0] or width < image.shape[1]
     interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
     resized = cv2.resize(image, (width, height), interpolation=interpolation)
     return torch.from_numpy(resized).permute(2, 0, 1).float() / 255

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from l3r.config import InferenceConfig
@@ -145,21 +145,27 @@ def _decode_both_ways(
     tree: SceneTree,
     config: InferenceConfig,
 ) -> tuple[PairPointmaps, PairPointmaps]:
-    """Decode every edge from either side, in the same chunks."""
+    """Decode every edge from either side, in the same chunks.
+
+    Without symmetrisation only the edges of leaves are decoded in reverse: their own views tell
+    their focal lengths. The reverse maps of other edges are then those of an arbitrary edge.
+    """
     parent, child = tree.parent[0], tree.child[0]
-    edges = DirectedEdges(parent=torch.cat([parent, child]), child=torch.cat([child, parent]))
-    both = decode_photos(model, tokens, sizes, edges, config.chunk_size)
-    half = tree.num_edges
-    return _select(both, slice(0, half)), _select(both, slice(half, None))
-
-
-def _select(pairs: PairPointmaps, edges: slice) -> PairPointmaps:
-    return PairPointmaps(
-        parent_pts3d=pairs.parent_pts3d[:, edges],
-        child_pts3d=pairs.child_pts3d[:, edges],
-        parent_log_conf=pairs.parent_log_conf[:, edges],
-        child_log_conf=pairs.child_log_conf[:, edges],
+    reverse = torch.arange(tree.num_edges)
+    if config.symmetrize == "off":
+        reverse = (~torch.isin(child, parent)).nonzero()[:, 0]
+    edges = DirectedEdges(
+        parent=torch.cat([parent, child[reverse]]), child=torch.cat([child, parent[reverse]])
     )
+    both = decode_photos(model, tokens, sizes, edges, config.chunk_size)
+    place = torch.full((tree.num_edges,), tree.num_edges)
+    place[reverse] += torch.arange(len(reverse))
+    return _select(both, torch.arange(tree.num_edges)), _select(both, place)
+
+
+def _select(pairs: PairPointmaps, edges: Int[Tensor, " e"]) -> PairPointmaps:
+    edges = edges.to(pairs.parent_pts3d.device)
+    return PairPointmaps(**{name: value[:, edges] for name, value in vars(pairs).items()})
 
 
 def _unpad(

@@ -56,6 +56,10 @@ class CameraMetrics:
         """Plain numbers by name."""
         return asdict(self)
 
+    def to_plain(self) -> dict[str, float | None]:
+        """Plain numbers by name, for JSON, which has no NaN: what is undefined is None."""
+        return {name: None if math.isnan(x) else x for name, x in self.to_dict().items()}
+
 
 def camera_metrics(
     pred_cam_from_world: Float[Tensor, "n 4 4"],

@@ -236,6 +236,13 @@ def _numbers(metrics: Mapping[str, Tensor], prefix: str) -> dict[str, float]:
 
 def _append_row(path: Path, row: Mapping[str, float]) -> None:
     is_new = not path.exists()
+    if not is_new:
+        with path.open(newline="") as stream:
+            header = next(csv.reader(stream), [])
+        if header != list(row):
+            raise LaunchError(
+                f"{path}: columns {header}, this version writes {list(row)}; move the file away"
+            )
     with path.open("a", newline="") as stream:
         writer = csv.DictWriter(stream, fieldnames=list(row))
         if is_new:

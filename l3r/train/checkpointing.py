@@ -17,10 +17,13 @@ from l3r.model.light3r import Light3R
 from l3r.version import __version__
 
 FREE_TO_CHANGE = {
+    "data.max_skip_rate",
     "data.num_workers",
     "train.accelerator",
     "train.checkpoint_every",
     "train.log_every",
+    "train.note",
+    "train.output_dir",
     "train.validate_every",
     "train.validation_graphs",
 }
@@ -63,12 +66,9 @@ def find_resume(checkpoint: Path, config: RunConfig) -> Path | None:
         return None
     before = _flatten(read_checkpoint(checkpoint)["l3r_config"])
     now = _flatten(to_plain(config))
-    free = set(FREE_TO_CHANGE)
-    if config.train.schedule == "constant":
-        free.add("train.max_steps")
     for key in sorted(before.keys() | now.keys()):
         old, new = before.get(key), now.get(key)
-        if old != new and key not in free:
+        if old != new and not _is_free(key, config):
             raise ConfigError(
                 f"{checkpoint}: made with {key}={old}, this run has {new}; "
                 "give that value, or another train.output_dir"
@@ -76,6 +76,13 @@ def find_resume(checkpoint: Path, config: RunConfig) -> Path | None:
     if config.train.max_steps < read_checkpoint(checkpoint).get("global_step", 0):
         raise CheckpointError(f"{checkpoint}: is past train.max_steps={config.train.max_steps}")
     return checkpoint
+
+
+def _is_free(key: str, config: RunConfig) -> bool:
+    if key == "train.max_steps":
+        return config.train.schedule == "constant"
+    # Shards may move, and inference is not trained.
+    return key in FREE_TO_CHANGE or key.endswith(".shards") or key.startswith("inference.")
 
 
 def _to_bytes(content: Mapping[str, Any]) -> bytes:

@@ -1,13 +1,24 @@
 """Loaders for the trainer, on the device that asks."""
 
+import logging
+
 import lightning as L
 import torch
 from torch.utils.data import DataLoader, Dataset
 
 from l3r.config import RunConfig
-from l3r.data.loader import DeviceShare, StepLoader, build_training_loader, open_folders, read_graph
+from l3r.data.loader import (
+    DeviceShare,
+    StepLoader,
+    build_training_loader,
+    open_folders,
+    read_or_next,
+)
 from l3r.data.source import ShardFolder
+from l3r.errors import DataError
 from l3r.types import Views
+
+log = logging.getLogger(__name__)
 
 
 class ShardData(L.LightningDataModule):
@@ -70,6 +81,12 @@ class ValidationGraphs(Dataset[Views]):
         return len(self.graphs)
 
     def __getitem__(self, index: int) -> Views:
-        """Read one graph, a batch of one."""
+        """Read one graph, a batch of one; the next stands in for an unreadable one."""
         folder, graph = self.graphs[index]
-        return read_graph(folder, graph, self.image_size)
+        skipped: list[str] = []
+        views = read_or_next(folder, graph, self.image_size, skipped)
+        for line in skipped:
+            log.warning("validation sample skipped: %s", line)
+        if views is None:
+            raise DataError(f"no validation graph can be read; last: {skipped[-1]}")
+        return views

@@ -9,6 +9,7 @@ import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 
 from l3r.config import RunConfig, to_yaml
+from l3r.errors import ConfigError
 from l3r.files import write_atomic
 from l3r.loss.joint import JointLoss
 from l3r.model.light3r import Light3R
@@ -32,6 +33,8 @@ def train(config: RunConfig) -> Path:
         DataError: The shards cannot be read.
         LaunchError: Too many bad steps in a row.
     """
+    if config.train.accelerator == "gpu" and not torch.cuda.is_available():
+        raise ConfigError("train.accelerator is gpu and torch finds none; use auto or cpu")
     folder = Path(config.train.output_dir)
     last = folder / "last.ckpt"
     resume_from = find_resume(last, config)

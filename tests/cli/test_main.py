@@ -110,6 +110,16 @@ def test_reconstruct_refuses_what_it_cannot_use(tmp_path, checkpoint, capsys):
     assert not (tmp_path / "out").exists()
 
 
+def test_what_an_earlier_run_wrote_among_the_photos_is_not_read_again(tmp_path, checkpoint, capsys):
+    for number in range(2):
+        save(tmp_path / f"{number}.jpg", 60, 80, exif=6)
+    out = tmp_path / "out"
+    words = ["reconstruct", str(tmp_path), "--checkpoint", str(checkpoint), "--out", str(out)]
+    for _ in range(2):
+        assert main(words) == 0
+        assert "of 2 images registered" in capsys.readouterr().out
+
+
 def test_graphs_are_scored_beside_the_identity(tmp_path, checkpoint, capsys):
     folder = write_folder(
         tmp_path / "shards", [make_graph(n, num_views=4, height=16, width=16) for n in range(3)]
@@ -126,3 +136,7 @@ def test_graphs_are_scored_beside_the_identity(tmp_path, checkpoint, capsys):
     assert main([*words, "--max-graphs", "1", "--untrained", *TINY]) == 0
     assert "1 graphs of 4 images" in capsys.readouterr().out
     assert main([*words, "--untrained", *TINY, "train.sed=1"]) == 2
+    assert main([*words, "--max-graphs", "0", "--untrained", *TINY]) == 2
+    nowhere = str(tmp_path / "nowhere" / "scores.json")
+    assert main([*words, "--untrained", *TINY, "--json", nowhere]) == 2
+    assert "nowhere" in capsys.readouterr().err

@@ -83,6 +83,9 @@ def test_printed_yaml_loads_as_a_layer(tmp_path):
         ("train.lr=0", "train.lr is 0.0, expected more than 0"),
         ("inference.pnp_error=0", "inference.pnp_error is 0.0"),
         ("train.clip_norm=-1", "train.clip_norm is -1.0"),
+        ("train.accelerator=abacus", "'abacus'.*gpu"),
+        ("train.betas=[0.9,1.5]", "from 0 to less than 1"),
+        ("inference.min_conf=-1", "inference.min_conf is -1.0"),
     ],
 )
 def test_a_bad_layer_gets_one_line_that_says_what_to_do(layer, message):

@@ -7,7 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from l3r.config import DataConfig, SourceConfig
-from l3r.data.loader import DeviceShare, build_training_loader, open_folders, read_graph
+from l3r.data.loader import (
+    DeviceShare,
+    build_training_loader,
+    open_folders,
+    read_graph,
+    read_or_next,
+)
 from l3r.data.sampling import SampleChooser
 from l3r.data.schema import index_path
 from l3r.data.source import ShardFolder
@@ -137,6 +143,26 @@ def test_an_unreadable_sample_is_named_and_another_takes_its_place(tmp_path, cap
     assert "00.jpg" in caplog.text
 
 
+def test_a_sample_that_cannot_be_cropped_is_skipped_too(tmp_path):
+    graphs = [make_graph(n, height=16, width=16) for n in range(6)]
+    graphs[3].K[:, 0, 2] = 900.0
+    folder = ShardFolder(write_folder(tmp_path, graphs), 3)
+    skipped = []
+    views = read_or_next(folder, 3, (16, 16), skipped)
+    assert views.key[0].endswith("hand-000004")
+    assert len(skipped) == 1
+    assert "principal point" in skipped[0]
+
+
+def test_a_span_takes_a_share_of_the_graphs_and_its_complement_the_rest(shards):
+    kept, held = ShardFolder(shards, 3, (0.0, 0.7)), ShardFolder(shards, 3, (0.7, 1.0))
+    names = [folder.key(i) for folder in (kept, held) for i in range(len(folder))]
+    assert (len(kept), len(held)) == (7, 3)
+    assert names == [ShardFolder(shards, 3).key(i) for i in range(10)]
+    with pytest.raises(ConfigError, match=r"span.*rising"):
+        SourceConfig(shards="x", span=[0.5, 0.5])
+
+
 def test_too_many_unreadable_samples_stop_the_run(tmp_path):
     folder = write_folder(tmp_path, [make_graph(n, height=16, width=16) for n in range(10)])
     for number in range(0, 10, 2):
@@ -149,8 +175,11 @@ def test_nothing_readable_stops_at_once(tmp_path):
     folder = write_folder(tmp_path, [make_graph(n, height=16, width=16) for n in range(2)])
     for number in range(2):
         spoil(folder, number)
-    with pytest.raises(DataError, match="no graph of source hand can be read"):
-        keys(loader(config(folder, max_skip_rate=1.0)))
+    for num_workers in (0, 1):
+        data = config(folder, max_skip_rate=1.0, num_workers=num_workers)
+        with pytest.raises(DataError, match="graphs in a row cannot be read") as error:
+            keys(loader(data))
+        assert "\n" not in str(error.value)  # even out of a worker
 
 
 def test_requests_that_cannot_be_met_say_what_to_do(shards, tmp_path):

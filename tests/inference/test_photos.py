@@ -133,3 +133,14 @@ def test_too_few_photos_and_equal_names_are_clear_errors(tmp_path):
     require_two(
         Photos(image=[torch.zeros(3, 4, 4)] * 2, original_size=[(4, 4)] * 2, file=["a", "b"]), 2
     )
+
+
+def test_a_photo_that_shrinks_in_one_direction_only_is_averaged(tmp_path):
+    """A checkerboard of columns: cubic sampling would alias, averaging gives grey."""
+    pixels = np.zeros((20, 2000, 3), np.uint8)
+    pixels[:, ::2] = 255
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    save(tmp_path / "b.png")
+    image = load_photos(find_photos(tmp_path), MODEL, tmp_path).photos.image[0]
+    assert image.shape[1] == 16
+    assert float((image - 0.5).abs().max()) < 0.1

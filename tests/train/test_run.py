@@ -1,4 +1,5 @@
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -111,6 +112,28 @@ def test_a_killed_run_goes_on_as_if_it_had_never_stopped(
     assert len(read_log(tmp_path, "validation.csv")) == 2
     first, second = (read_checkpoint(f / "model.ckpt")["state_dict"] for f in (tmp_path, finished))
     assert all(torch.equal(first[key], second[key]) for key in second)
+
+
+def test_a_run_may_move_with_its_shards(hand_shards, finished, tmp_path):
+    train(load_config(layers(hand_shards, tmp_path / "a", max_steps=5)))
+    shutil.copytree(tmp_path / "a", tmp_path / "b")
+    shutil.copytree(hand_shards, tmp_path / "shards")
+    train(load_config(layers(tmp_path / "shards", tmp_path / "b", max_steps=12, note="moved")))
+    assert losses(tmp_path / "b") == losses(finished)
+
+
+def test_a_log_of_other_columns_is_not_mixed(hand_shards, tmp_path):
+    train(load_config(layers(hand_shards, tmp_path, max_steps=5)))
+    log = tmp_path / "metrics.csv"
+    log.write_text(log.read_text().replace("pair_error", "old_error"))
+    with pytest.raises(LaunchError, match="move the file away"):
+        train(load_config(layers(hand_shards, tmp_path, max_steps=6)))
+
+
+def test_a_gpu_that_is_not_there_is_a_clear_error(hand_shards, tmp_path, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(ConfigError, match=r"train\.accelerator is gpu"):
+        train(load_config(layers(hand_shards, tmp_path, accelerator="gpu")))
 
 
 def test_half_a_written_row_is_dropped_at_resume(finished, hand_shards, tmp_path):
