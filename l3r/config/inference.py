@@ -23,7 +23,8 @@ class InferenceConfig:
     pnp_points: int = 2000
     """Points sampled for PnP."""
     pnp_error: float = 0.01
-    """RANSAC's inlier threshold as a share of the photo's long side."""
+    """RANSAC's inlier threshold as a share of the photo's long side; at least one of the pixels
+    that the network sees."""
     pnp_iterations: int = 200
     """RANSAC's rounds at most."""
     seed: int = 0

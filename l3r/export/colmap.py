@@ -31,8 +31,12 @@ def write_colmap(
     counts = torch.bincount(sample.view, minlength=len(scene.cameras.file)).tolist()
     # The sample holds one image after the other.
     keypoints = torch.split(sample.pts2d.cpu(), counts)
-    for view in scene.cameras.registered.nonzero()[:, 0].tolist():
-        _add_image(model, scene.cameras, view, keypoints[view].numpy())
+    registered = scene.cameras.registered.tolist()
+    for view, K in enumerate(scene.cameras.K):
+        if K.isfinite().all():
+            _add_camera(model, scene.cameras, view)
+        if registered[view]:
+            _add_image(model, scene.cameras, view, keypoints[view].numpy())
     _add_points(model, sample)
     model.update_point_3d_errors()
     folder.mkdir(parents=True, exist_ok=True)
@@ -40,10 +44,8 @@ def write_colmap(
     return len(sample.view)
 
 
-def _add_image(
-    model: pycolmap.Reconstruction, cameras: Cameras, view: int, keypoints: np.ndarray
-) -> None:
-    """Add an image with its camera; COLMAP counts both from 1."""
+def _add_camera(model: pycolmap.Reconstruction, cameras: Cameras, view: int) -> None:
+    """Add the camera of an image, registered or not; COLMAP counts from 1."""
     height, width = cameras.image_size[view]
     K = cameras.K[view].double().cpu().numpy()
     camera = pycolmap.Camera(
@@ -54,6 +56,12 @@ def _add_image(
         camera_id=view + 1,
     )
     model.add_camera_with_trivial_rig(camera)
+
+
+def _add_image(
+    model: pycolmap.Reconstruction, cameras: Cameras, view: int, keypoints: np.ndarray
+) -> None:
+    """Add a registered image; its camera is there."""
     image = pycolmap.Image(
         name=cameras.file[view], keypoints=keypoints, camera_id=view + 1, image_id=view + 1
     )

@@ -107,7 +107,7 @@ def fit_cameras(
             pts3d[view, chosen],
             pixels[view, chosen],
             K[view],
-            max_error_px=config.pnp_error * max(original_sizes[view]),
+            max_error_px=_max_error_px(original_sizes[view], (height, width), config),
             num_iterations=config.pnp_iterations,
             seed=config.seed,
         )
@@ -115,6 +115,12 @@ def fit_cameras(
             cam_from_world[view] = fit.cam_from_world
     registered = cam_from_world.isfinite().flatten(1).all(-1)
     return CameraFits(cam_from_world=cam_from_world, registered=registered, point_rule=rules)
+
+
+def _max_error_px(original: Size, size: Size, config: InferenceConfig) -> float:
+    """RANSAC's threshold in original pixels; the network's points are no finer than its pixels."""
+    long_side = max(original)
+    return max(config.pnp_error * long_side, long_side / max(size))
 
 
 def choose_points(
