@@ -1,6 +1,20 @@
+import os
+
 import pytest
+import torch
 
 from tests.data.graphs import make_graph, write_folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread():
+    """Sums of many threads differ in the last bit, and equal losses are what is tested here."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    os.environ["OMP_NUM_THREADS"] = "1"
+    yield
+    del os.environ["OMP_NUM_THREADS"]
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="session")
