@@ -1,4 +1,4 @@
-"""How alike two views are; what an edge then costs is in ``trees.edge_costs``."""
+"""How alike two views are; what an edge then costs is in ``edge_costs``."""
 
 import torch.nn.functional as F
 from jaxtyping import Float

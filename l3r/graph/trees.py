@@ -10,6 +10,7 @@ from torch import Tensor
 
 from l3r.config import GraphConfig
 from l3r.errors import GeometryError
+from l3r.graph.edge_costs import edge_costs
 from l3r.types import SceneTree
 
 
@@ -38,22 +39,6 @@ def build_tree(scores: Float[Tensor, "b n n"], config: GraphConfig) -> SceneTree
     root = find_root(similarity)
     sum_costs = config.algorithm != "mst"
     return _order_edges(_grow_tree(costs, root, sum_costs=sum_costs), costs, root)
-
-
-def edge_costs(similarity: Float[np.ndarray, "b n n"], config: GraphConfig) -> np.ndarray:
-    """Turn similarities into positive costs; infinite on the diagonal.
-
-    The paper's cost -S has no shortest paths (negative cycles). 1 - S orders edges alike and is
-    floored at 1e-6, so that no path through duplicates is free. On overlaps, where 1 - S gives
-    nothing but the star around the root, ``oracle`` takes -log S: the path of largest product.
-    """
-    if config.algorithm == "oracle" or config.cost == "neg_log":
-        costs: np.ndarray = -np.log(np.clip(similarity, 1e-6, 1 - 1e-6))
-    else:
-        costs = np.maximum(1 - similarity, 1e-6) ** config.cost_power
-    view = np.arange(costs.shape[-1])
-    costs[:, view, view] = np.inf
-    return costs
 
 
 def find_root(similarity: Float[np.ndarray, "b n n"]) -> Int[np.ndarray, " b"]:

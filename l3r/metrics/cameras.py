@@ -25,7 +25,11 @@ accuracy (NaN), so that a mean leaves it out. The registration rate counts them 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraMetrics:
-    """Scores of one scene, or their mean; rates in percent, higher is better, but for the ATEs."""
+    """Scores of one scene, or their mean; rates in percent, higher is better, but for the ATEs.
+
+    To add a metric: a field here, its value in :func:`camera_metrics`. The tables of ``l3r eval``,
+    ``validation.csv`` and every JSON file list all fields.
+    """
 
     rra_5: float
     """Pairs with a relative rotation error below 5 degrees."""

@@ -7,8 +7,9 @@ from scipy.sparse.csgraph import connected_components, minimum_spanning_tree, sh
 
 from l3r.config import GraphConfig
 from l3r.errors import GeometryError
+from l3r.graph.edge_costs import edge_costs
 from l3r.graph.scores import similarity_scores
-from l3r.graph.trees import build_tree, edge_costs, find_root, sparsify
+from l3r.graph.trees import build_tree, find_root, sparsify
 from tests.geometry.scenes import generator
 from tests.graph.scenes import random_scores
 

@@ -56,7 +56,9 @@ def test_loss_and_gradients_equal_the_recorded_ones(recorded, criterion, normali
     free_scale = torch.zeros(len(points[0]), dtype=torch.bool)
     factors = scale_factors(pairs, target, free_scale, normalize)
     loss = pairwise_loss(pairs, target, factors, config).loss
-    assert float(loss.detach()) == pytest.approx(float(recorded[f"{criterion}__f64__loss"]), abs=CLOSE)
+    assert float(loss.detach()) == pytest.approx(
+        float(recorded[f"{criterion}__f64__loss"]), abs=CLOSE
+    )
     loss.backward()
     names = {"grad_pred_pts1": points[0], "grad_pred_pts2": points[1]}
     if has_conf:
