@@ -185,8 +185,8 @@ def _write_tar(path: Path, cache: FrameCache, plans: list[GraphPlan]) -> tuple[S
             # One by one, since a whole sample would be written in alphabetical order.
             for name, data in list(members.items())[1:]:
                 writer.write({"__key__": plan.key, name: data})
-    with path.open("rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    with path.open("rb") as written:
+        digest = hashlib.file_digest(written, "sha256").hexdigest()
     return index_shard(path), digest
 
 

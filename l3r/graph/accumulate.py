@@ -8,6 +8,7 @@ transforms are then composed level by level, 4x4 by 4x4. The answer is the edge-
 """
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -40,9 +41,8 @@ def accumulate(pairs: PairPointmaps, tree: SceneTree, config: GraphConfig) -> Wo
 
 def _accumulate(pairs: PairPointmaps, tree: SceneTree, config: GraphConfig) -> WorldPointmaps:
     device = pairs.parent_pts3d.device
-    parent, parent_edge, level = (
-        index.to(device, non_blocking=True) for index in (tree.parent, tree.parent_edge, tree.level)
-    )
+    parent_edge = tree.parent_edge.to(device, non_blocking=True)
+    level = tree.level.to(device, non_blocking=True)
     # Slot 0 holds the map the root came with, slot e + 1 the one that edge e's child came with.
     arrived_pts3d = torch.cat([pairs.parent_pts3d[:, :1], pairs.child_pts3d], dim=1)
     arrived_log_conf = torch.cat([pairs.parent_log_conf[:, :1], pairs.child_log_conf], dim=1)
@@ -55,7 +55,8 @@ def _accumulate(pairs: PairPointmaps, tree: SceneTree, config: GraphConfig) -> W
     target = _take(arrived_pts3d, slot[:, 1:])
     source = pairs.parent_pts3d[:, 1:]
     arrived_from_edge = fit_similarity(target, source, weights[:, 1:], with_scale=config.with_scale)
-    residual = fit_residual(arrived_from_edge, target, source, weights[:, 1:])
+    with torch.no_grad():  # a diagnosis, not trained
+        residual = fit_residual(arrived_from_edge, target, source, weights[:, 1:])
     world_from_edge = compose_along_tree(
         _prepend_identity(arrived_from_edge), parent_edge, level, tree.num_levels
     )
@@ -65,9 +66,7 @@ def _accumulate(pairs: PairPointmaps, tree: SceneTree, config: GraphConfig) -> W
     return WorldPointmaps(
         pts3d_world=_take(by_slot, slot_of_view),
         log_conf=_take(log_conf, slot_of_view),
-        residual=torch.cat([torch.zeros_like(residual[:, :1]), residual], dim=1)
-        if residual.shape[1]
-        else residual.new_zeros(parent.shape),
+        residual=F.pad(residual, (1, 0)),
     )
 
 
