@@ -83,7 +83,9 @@ def fit_similarity(
     spread_b, spread_a = _spread(b, center_b, weights), _spread(a, center_a, weights)
     b, a = b / spread_b[..., None, None], a / spread_a[..., None, None]
     covariance = (b * weights[..., None]).transpose(-1, -2) @ a
-    R = roma.special_procrustes(covariance)
+    # roma keeps constants from its first call: made in inference mode, they would fail in training.
+    with torch.inference_mode(mode=False):
+        R = roma.special_procrustes(covariance)
     scale = torch.ones_like(spread_b)
     if with_scale:
         # Umeyama's trace(D S) / variance, the trace being that of R^T times the covariance.

@@ -1,3 +1,6 @@
+import subprocess
+import sys
+
 import pytest
 import roma
 import torch
@@ -146,3 +149,17 @@ def test_degenerate_points_give_finite_answers_and_gradients(case, dtype, with_s
     torch.testing.assert_close(torch.linalg.det(fit.R), torch.ones(2, dtype=dtype))
     if case == "coincident":
         assert fit.scale.tolist() == [1, 1]
+
+
+def test_a_fit_made_in_inference_mode_does_not_spoil_later_training():
+    """In a process of its own: what roma keeps between calls must be made by the first fit."""
+    program = (
+        "import torch; from l3r.geometry.similarity import fit_similarity as fit\n"
+        "b, a, w = torch.rand(1, 9, 3), torch.rand(1, 9, 3), torch.ones(1, 9)\n"
+        "with torch.inference_mode(): fit(b, a, w)\n"
+        "a.requires_grad_()\n"
+        "fit(b, a, w).transform(a).sum().backward()\n"
+        "assert a.grad.isfinite().all()"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
