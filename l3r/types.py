@@ -14,7 +14,7 @@ which carry no weight anywhere.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -31,7 +31,8 @@ class Views:
     image: Float[Tensor, "b n 3 h w"]
     """RGB in [0, 1]."""
     true_shape: Int[Tensor, "b n 2"]
-    """(height, width) of each image as it was photographed."""
+    """(height, width) of each image as it was photographed: that of ``image``, or swapped where the
+    image is stored with its pixel axes swapped. Stays on the host, where shapes are decided."""
     K: Float[Tensor, "b n 3 3"]
     """Intrinsics in pixels of ``image``; centre of the top-left pixel at (0.5, 0.5)."""
     world_from_cam: Float[Tensor, "b n 4 4"]
@@ -54,8 +55,9 @@ class Views:
         return self._map(lambda tensor: tensor.pin_memory())
 
     def to(self, device: torch.device | str) -> "Views":
-        """Move every tensor."""
-        return self._map(lambda tensor: tensor.to(device))
+        """Move every tensor but ``true_shape``; from pinned memory without waiting."""
+        moved = self._map(lambda tensor: tensor.to(device, non_blocking=tensor.is_pinned()))
+        return replace(moved, true_shape=self.true_shape)
 
     def _map(self, function: Callable[[Tensor], Tensor]) -> "Views":
         changed: dict[str, Any] = {
@@ -66,16 +68,37 @@ class Views:
         return replace(self, **changed)
 
 
+class Window(NamedTuple):
+    """A rectangle of an image, in the image's pixels; its sides may fall between pixels."""
+
+    left: float
+    top: float
+    width: float
+    height: float
+
+    @classmethod
+    def whole(cls, height: int, width: int) -> "Window":
+        """The window that is all of an image."""
+        return cls(left=0.0, top=0.0, width=float(width), height=float(height))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Photos:
     """Photos of any shapes, in their own orientation and in the user's order."""
 
     image: list[Float[Tensor, "3 _h _w"]]
-    """RGB in [0, 1]; sides are multiples of the model's patch."""
+    """RGB in [0, 1], what the network sees; sides are multiples of the model's patch."""
     original_size: list[tuple[int, int]]
-    """(height, width) of each photo, upright, before scaling."""
+    """(height, width) of each photo, upright, before scaling and cropping."""
+    window: list[Window]
+    """The part of each photo that ``image`` shows, in pixels of the photo."""
     file: list[str]
     """Name of each photo, relative to the folder it was read from."""
+
+    @property
+    def network_size(self) -> list[tuple[int, int]]:
+        """(height, width) of each ``image``."""
+        return [(image.shape[1], image.shape[2]) for image in self.image]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,6 +195,8 @@ class Reconstruction:
     cameras: Cameras
     image: list[Float[Tensor, "3 _h _w"]]
     """The photos as the network saw them."""
+    window: list[Window]
+    """The part of each photo that the network saw, in pixels of the photo at its own size."""
     pts3d_world: list[Float[Tensor, "_h _w 3"]]
     """Dense points of each image, in the root camera's frame."""
     conf: list[Float[Tensor, "_h _w"]]

@@ -5,7 +5,14 @@ from l3r.config.graph import GraphConfig
 from l3r.config.inference import InferenceConfig
 from l3r.config.layers import from_plain, load_config, override_config, to_plain, to_yaml
 from l3r.config.loss import LossConfig
-from l3r.config.model import AlignmentConfig, DecoderConfig, EncoderConfig, ModelConfig
+from l3r.config.model import (
+    AlignmentConfig,
+    DecoderConfig,
+    DptConfig,
+    EncoderConfig,
+    ModelConfig,
+    Precision,
+)
 from l3r.config.run import RunConfig
 from l3r.config.train import TrainConfig
 
@@ -13,11 +20,13 @@ __all__ = [
     "AlignmentConfig",
     "DataConfig",
     "DecoderConfig",
+    "DptConfig",
     "EncoderConfig",
     "GraphConfig",
     "InferenceConfig",
     "LossConfig",
     "ModelConfig",
+    "Precision",
     "RunConfig",
     "SourceConfig",
     "TrainConfig",

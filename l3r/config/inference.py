@@ -4,14 +4,24 @@ from dataclasses import dataclass
 from typing import Literal
 
 from l3r.config.check import require
+from l3r.config.model import Precision
+
+Crop = Literal["whole", "official"]
 
 
 @dataclass(kw_only=True, slots=True)
 class InferenceConfig:
     """Symmetrisation, point selection and camera fitting."""
 
+    crop: Crop = "whole"
+    """``whole``: nothing is cut off; the long side becomes that of ``model.image_size``, each side
+    then the nearest multiple of the patch. ``official``: DUSt3R's and MASt3R's released loader; the
+    photo is scaled as it is and cut, about its centre, to a square where ``model.image_size`` is
+    one, else to multiples of the patch (square photos to 4:3)."""
     chunk_size: int = 32
     """Images encoded, and edges decoded, at once."""
+    precision: Precision = "fp32"
+    """Of encoder, alignment and decoder; heads and Procrustes stay in float32."""
     symmetrize: Literal["child", "both", "off"] = "child"
     """Decode each edge both ways and average; the fit uses the child's map, or both maps."""
     min_conf: float = 3.0

@@ -5,6 +5,9 @@ from typing import Literal
 
 from l3r.config.check import require
 
+Precision = Literal["fp32", "bf16"]
+"""What the transformer computes in."""
+
 
 @dataclass(kw_only=True, slots=True)
 class EncoderConfig:
@@ -61,6 +64,26 @@ class DecoderConfig:
 
 
 @dataclass(kw_only=True, slots=True)
+class DptConfig:
+    """Channels of the DPT head; the released networks have these, whatever their width."""
+
+    stage_channels: list[int] = field(default_factory=lambda: [96, 192, 384, 768])
+    """Channels of the four stages, finest first."""
+    fusion_channels: int = 256
+    """Channels while stages are fused."""
+    out_channels: int = 128
+    """Channels of the last convolutions."""
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        stages = self.stage_channels
+        is_four = len(stages) == 4 and all(channels >= 1 for channels in stages)
+        require(is_four, "model.dpt.stage_channels", stages, "four numbers, each at least 1")
+        for key in ("fusion_channels", "out_channels"):
+            require(getattr(self, key) >= 1, f"model.dpt.{key}", getattr(self, key), "at least 1")
+
+
+@dataclass(kw_only=True, slots=True)
 class ModelConfig:
     """The whole network."""
 
@@ -70,20 +93,31 @@ class ModelConfig:
     """Latent global alignment."""
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
     """Pairwise decoder."""
-    head: Literal["linear"] = "linear"
+    head: Literal["linear", "dpt"] = "linear"
     """What turns decoder tokens into points and confidences."""
+    dpt: DptConfig = field(default_factory=DptConfig)
+    """Sizes of the head where it is ``dpt``."""
     image_size: list[int] = field(default_factory=lambda: [224, 224])
-    """[height, width] the network is trained at [px]; photos are scaled to its long side."""
+    """[height, width] the network is trained at [px], landscape or square; portrait images take it
+    with height and width swapped, photos to reconstruct are scaled to its long side."""
 
     def __post_init__(self) -> None:
         """Check ranges across parts."""
         patch = self.encoder.patch_size
         require(
             len(self.image_size) == 2
-            and all(s >= patch and s % patch == 0 for s in self.image_size),
+            and all(s >= patch and s % patch == 0 for s in self.image_size)
+            and self.image_size[0] <= self.image_size[1],
             "model.image_size",
             self.image_size,
-            f"[height, width], multiples of the patch size {patch}",
+            f"[height, width], multiples of the patch size {patch}, height at most width",
+        )
+        require(
+            self.head != "dpt" or (patch == 16 and self.decoder.depth >= 4),
+            "model.head",
+            self.head,
+            f"linear, or patches of 16 (not {patch}) and 4 or more decoder blocks (not "
+            f"{self.decoder.depth})",
         )
         require(
             self.encoder.width % self.alignment.num_heads == 0,

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from l3r.config.check import require
+from l3r.config.model import Precision
 
 
 @dataclass(kw_only=True, slots=True)
@@ -14,6 +15,9 @@ class TrainConfig:
     """Where checkpoints, ``metrics.csv`` and ``config.yaml`` go; a run found there is resumed."""
     note: str = ""
     """What whoever uses the weights should know; ``l3r reconstruct`` prints it."""
+    init: str = ""
+    """Weights to start from: a Light3R checkpoint, or an official file (docs/weights.md); a resumed
+    run does not read it."""
     seed: int = 0
     """Seed of weights and of every sample drawn."""
     max_steps: int = 100_000
@@ -44,6 +48,12 @@ class TrainConfig:
     """Steps between rows of ``metrics.csv``."""
     accelerator: Literal["auto", "cpu", "gpu"] = "auto"
     """Where to train; ``auto`` takes a GPU if there is one."""
+    precision: Precision = "fp32"
+    """Of encoder, alignment and decoder; weights, heads, Procrustes and loss stay in float32."""
+    compile: bool = False
+    """Compile transformer blocks and DPT heads; the first steps take minutes, later ones less."""
+    gradient_checkpointing: bool = False
+    """Keep only the input of every block for the backward pass, which computes it again."""
 
     def __post_init__(self) -> None:
         """Check ranges."""

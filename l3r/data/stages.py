@@ -14,6 +14,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from l3r.data.schema import GraphSample
 from l3r.errors import DataError
+from l3r.geometry.camera import transpose_K
 from l3r.types import Views
 
 
@@ -29,26 +30,28 @@ class KeyedGraph:
 def resize_crop(
     samples: Iterable[KeyedGraph], *, image_size: tuple[int, int]
 ) -> Iterator[KeyedGraph]:
-    """Bring every image to one size: crop around the principal point, then scale.
+    """Bring every image to one shape: crop around the principal point, then scale.
 
-    The crop is the largest of the target's aspect that is centred on the principal point, so that
+    Every image takes the shape in its own orientation: portrait images with height and width
+    swapped. The crop is the largest of that aspect that is centred on the principal point, so that
     the principal point ends up in the middle. Colour is averaged over areas; depth takes the
     nearest sample, since the mean of two surfaces lies on neither.
 
     Args:
         samples: Graphs.
-        image_size: Target (height, width).
+        image_size: Target (height, width), landscape or square.
 
     Yields:
-        Graphs whose images, depths and ``K`` match.
+        Graphs whose images, depths and ``K`` match, upright.
 
     Raises:
         DataError: A principal point lies outside its image.
     """
+    assert image_size[0] <= image_size[1], image_size
     for sample in samples:
         graph = sample.graph
         fitted = [
-            _fit_view(image, depth, K, image_size, f"{sample.key}: {file}")
+            _fit_view(image, depth, K, _oriented(image_size, image), f"{sample.key}: {file}")
             for image, depth, K, file in zip(
                 graph.image, graph.depth, graph.K, graph.file, strict=True
             )
@@ -59,17 +62,27 @@ def resize_crop(
 
 
 def to_views(samples: Iterable[KeyedGraph]) -> Iterator[Views]:
-    """Turn each graph, its images of one size, into a batch of one."""
+    """Turn each graph into a batch of one, its images laid out landscape.
+
+    Portrait images are transposed with their depth, and the first two rows of their ``K`` are
+    swapped, so that all images of a shape stack; ``true_shape`` keeps the upright shapes. Cameras,
+    and so points, are those of the upright images.
+
+    Args:
+        samples: Graphs whose images have one shape but for orientation, see :func:`resize_crop`.
+    """
     for sample in samples:
         graph = sample.graph
-        image = torch.from_numpy(np.stack(graph.image)).permute(0, 3, 1, 2).float() / 255
-        depth = torch.from_numpy(np.stack(graph.depth))
-        height, width = image.shape[-2:]
+        image = torch.from_numpy(np.stack([_landscape(pixels) for pixels in graph.image]))
+        depth = torch.from_numpy(np.stack([_landscape(z) for z in graph.depth]))
+        K = torch.from_numpy(graph.K)
+        true_shape = torch.tensor([pixels.shape[:2] for pixels in graph.image])
+        is_portrait = (true_shape[:, 0] > true_shape[:, 1])[:, None, None]
         world_from_cam = np.linalg.inv(graph.cam_from_world)
         yield Views(
-            image=image[None],
-            true_shape=torch.tensor([height, width]).expand(1, len(image), 2).clone(),
-            K=torch.from_numpy(graph.K).float()[None],
+            image=image.permute(0, 3, 1, 2).float()[None] / 255,
+            true_shape=true_shape[None],
+            K=torch.where(is_portrait, transpose_K(K), K).float()[None],
             world_from_cam=torch.from_numpy(world_from_cam).float()[None],
             depth=depth[None],
             valid=(depth > 0)[None],
@@ -94,6 +107,17 @@ def collate(batch: Sequence[Views]) -> Views:
         scores=torch.cat([v.scores for v in batch]),
         key=[key for v in batch for key in v.key],
     )
+
+
+def _oriented(image_size: tuple[int, int], image: np.ndarray) -> tuple[int, int]:
+    """The target (height, width) in the orientation of an image."""
+    height, width = image_size
+    return (width, height) if image.shape[0] > image.shape[1] else (height, width)
+
+
+def _landscape(pixels: np.ndarray) -> np.ndarray:
+    """Swap the two pixel axes of what is portrait."""
+    return pixels.swapaxes(0, 1) if pixels.shape[0] > pixels.shape[1] else pixels
 
 
 def _fit_view(

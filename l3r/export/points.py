@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from l3r.config import InferenceConfig
-from l3r.geometry.camera import pixel_centers
+from l3r.geometry.camera import window_centers
 from l3r.types import Reconstruction
 
 _DEFAULT = InferenceConfig()
@@ -34,7 +34,7 @@ class PointSample:
     pts3d_world: Float[Tensor, "p 3"]
     """Positions in the world."""
     pts2d: Float[Tensor, "p 2"]
-    """Where the image saw it: pixel centre (x, y) in the image at its own size, float64."""
+    """Where the image saw it: pixel centre (x, y) in the photo at its own size, float64."""
     color: UInt8[Tensor, "p 3"]
     """RGB."""
     conf: Float[Tensor, " p"]
@@ -108,13 +108,13 @@ def _thin(pixels: Int[Tensor, " p"], quota: int, view: int) -> Int[Tensor, " q"]
 
 def _take(scene: Reconstruction, view: int, pixels: Int[Tensor, " p"]) -> PointSample:
     conf = scene.conf[view]
-    (height, width), original = conf.shape, scene.cameras.image_size[view]
-    scale = torch.tensor([original[1] / width, original[0] / height], dtype=torch.float64)
+    height, width = conf.shape
+    pts2d = window_centers(height, width, scene.window[view], torch.zeros(0, dtype=torch.float64))
     rgb = scene.image[view].flatten(1).T[pixels]
     return PointSample(
         view=torch.full_like(pixels, view),
         pts3d_world=scene.pts3d_world[view].reshape(-1, 3)[pixels],
-        pts2d=pixel_centers(height, width, like=scale)[pixels] * scale,
+        pts2d=pts2d[pixels],
         color=(rgb * 255).round().clamp(0, 255).to(torch.uint8),
         conf=conf.flatten()[pixels],
     )

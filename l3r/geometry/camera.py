@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from l3r.types import Window
+
 
 def pixel_centers(height: int, width: int, like: Tensor) -> Float[Tensor, "p 2"]:
     """Centres (x, y) of all pixels, row by row, in the dtype and on the device of ``like``."""
@@ -15,6 +17,21 @@ def pixel_centers(height: int, width: int, like: Tensor) -> Float[Tensor, "p 2"]
     x = torch.arange(width, dtype=like.dtype, device=like.device) + 0.5
     grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
     return torch.stack([grid_x, grid_y], dim=-1).reshape(-1, 2)
+
+
+def window_centers(height: int, width: int, window: Window, like: Tensor) -> Float[Tensor, "p 2"]:
+    """Centres (x, y) of all pixels of a resized window, in pixels of the image it was cut from.
+
+    Args:
+        height: Rows of the resized window.
+        width: Columns of it.
+        window: What was cut out, before it was resized.
+        like: Gives dtype and device.
+    """
+    corner = [window.left, window.top]
+    scale = [window.width / width, window.height / height]
+    affine = like.new_tensor([corner, scale])
+    return affine[0] + pixel_centers(height, width, like) * affine[1]
 
 
 def resize_K(K: Float[Tensor, "*b 3 3"], scale_x: float, scale_y: float) -> Float[Tensor, "*b 3 3"]:

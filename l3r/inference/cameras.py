@@ -1,6 +1,5 @@
 """Cameras from point maps: focal length by Weiszfeld, then RANSAC-PnP."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -8,12 +7,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from l3r.config import InferenceConfig
-from l3r.geometry.camera import pixel_centers
+from l3r.geometry.camera import window_centers
 from l3r.geometry.focal import fit_focal
 from l3r.geometry.pnp import fit_camera
-from l3r.types import PairPointmaps, SceneTree, WorldPointmaps
-
-Size = tuple[int, int]
+from l3r.types import PairPointmaps, Photos, SceneTree, WorldPointmaps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,18 +57,17 @@ def collect_self_views(pairs: PairPointmaps, reverse: PairPointmaps, tree: Scene
     return SelfViews(pts3d_cam=points / total.clamp_min(1e-12)[..., None], log_conf=total)
 
 
-def fit_intrinsics(
-    views: SelfViews, sizes: Sequence[Size], original_sizes: Sequence[Size]
-) -> Float[Tensor, "n 3 3"]:
-    """Fit one focal length per photo, in its original pixels; the principal point is the centre.
+def fit_intrinsics(views: SelfViews, photos: Photos) -> Float[Tensor, "n 3 3"]:
+    """Fit one focal length per photo, in its original pixels; the principal point is its centre.
 
-    Sides scale by slightly different factors to whole patches, which original pixels undo.
+    Sides scale by slightly different factors to whole patches, and a crop may be off the centre by
+    a fraction of a pixel; original pixels undo both.
 
     Returns:
         K of each photo at its original size, float64; NaN focal where nothing could be fitted.
     """
-    pixels = padded_pixels(sizes, original_sizes, views.log_conf)
-    size = torch.tensor(original_sizes, dtype=torch.float64)
+    pixels = padded_pixels(photos, views.log_conf)
+    size = torch.tensor(photos.original_size, dtype=torch.float64)
     center = size.flip(-1) / 2
     centered = pixels - center.to(pixels)[:, None]
     focal = fit_focal(views.pts3d_cam, centered, views.log_conf).double().cpu()
@@ -85,8 +81,7 @@ def fit_intrinsics(
 def fit_cameras(
     world: WorldPointmaps,
     K: Float[Tensor, "n 3 3"],
-    sizes: Sequence[Size],
-    original_sizes: Sequence[Size],
+    photos: Photos,
     config: InferenceConfig,
 ) -> CameraFits:
     """Register every image against its points in the world (a batch of one).
@@ -95,10 +90,10 @@ def fit_cameras(
     no camera agrees with four points.
     """
     pts3d, log_conf = world.pts3d_world[0].cpu(), world.log_conf[0].cpu()
-    pixels = padded_pixels(sizes, original_sizes, log_conf)
-    cam_from_world = torch.full((len(sizes), 4, 4), torch.nan, dtype=torch.float64)
+    pixels = padded_pixels(photos, log_conf)
+    cam_from_world = torch.full((len(K), 4, 4), torch.nan, dtype=torch.float64)
     rules = []
-    for view, (height, width) in enumerate(sizes):
+    for view, (height, width) in enumerate(photos.network_size):
         chosen, rule = choose_points(log_conf[view, : height * width], config, view)
         rules.append(rule)
         if rule == "none" or not K[view].isfinite().all():
@@ -107,7 +102,7 @@ def fit_cameras(
             pts3d[view, chosen],
             pixels[view, chosen],
             K[view],
-            max_error_px=_max_error_px(original_sizes[view], (height, width), config),
+            max_error_px=_max_error_px(photos, view, config),
             num_iterations=config.pnp_iterations,
             seed=config.seed,
         )
@@ -117,10 +112,11 @@ def fit_cameras(
     return CameraFits(cam_from_world=cam_from_world, registered=registered, point_rule=rules)
 
 
-def _max_error_px(original: Size, size: Size, config: InferenceConfig) -> float:
+def _max_error_px(photos: Photos, view: int, config: InferenceConfig) -> float:
     """RANSAC's threshold in original pixels; the network's points are no finer than its pixels."""
-    long_side = max(original)
-    return max(config.pnp_error * long_side, long_side / max(size))
+    window = photos.window[view]
+    network_pixel = max(window.width, window.height) / max(photos.network_size[view])
+    return max(config.pnp_error * max(photos.original_size[view]), network_pixel)
 
 
 def choose_points(
@@ -146,12 +142,10 @@ def choose_points(
     return chosen[order], rule
 
 
-def padded_pixels(
-    sizes: Sequence[Size], original_sizes: Sequence[Size], like: Float[Tensor, "n p"]
-) -> Float[Tensor, "n p 2"]:
+def padded_pixels(photos: Photos, like: Float[Tensor, "n p"]) -> Float[Tensor, "n p 2"]:
     """Pixel centres of each network image, in original pixels; zero where padded."""
     pixels = like.new_zeros(*like.shape, 2)
-    for view, ((height, width), original) in enumerate(zip(sizes, original_sizes, strict=True)):
-        scale = like.new_tensor([original[1] / width, original[0] / height])
-        pixels[view, : height * width] = pixel_centers(height, width, like) * scale
+    for view, (height, width) in enumerate(photos.network_size):
+        centers = window_centers(height, width, photos.window[view], like)
+        pixels[view, : height * width] = centers
     return pixels

@@ -25,8 +25,7 @@ def encode_photos(model: Light3R, photos: Photos, chunk_size: int) -> list[Float
     """Encode every photo once; images of one shape go in chunks together."""
     device = next(model.parameters()).device
     tokens: list[Tensor] = [torch.empty(0)] * len(photos.image)
-    sizes = image_sizes(photos)
-    for views in _chunks_by_key(sizes, chunk_size):
+    for views in _chunks_by_key(photos.network_size, chunk_size):
         image = torch.stack([photos.image[view] for view in views]).to(device)
         for view, encoded in zip(views, model.encode(image), strict=True):
             tokens[view] = encoded
@@ -68,14 +67,10 @@ def decode_photos(
         parent_size, child_size = shapes[chunk[0]]
         parent_tokens = torch.stack([tokens[pairs[edge][0]] for edge in chunk])
         child_tokens = torch.stack([tokens[pairs[edge][1]] for edge in chunk])
-        decoded = model.decode(parent_tokens, child_tokens, parent_size, child_size)
+        grids = [model.encoder.token_grid(*size) for size in (parent_size, child_size)]
+        decoded = model.decode(parent_tokens, child_tokens, *grids)
         _store(maps, decoded, torch.tensor(chunk, device=parent_tokens.device))
     return maps
-
-
-def image_sizes(photos: Photos) -> list[Size]:
-    """Size (height, width) of each photo as the network sees it."""
-    return [(image.shape[1], image.shape[2]) for image in photos.image]
 
 
 def _chunks_by_key(keys: Sequence[object], chunk_size: int) -> Iterator[list[int]]:

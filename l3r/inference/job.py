@@ -68,7 +68,7 @@ def reconstruct_folder(
     with clock.stage("model"):
         model, config = load_model_and_config(checkpoint, clock.device, settings)
     with clock.stage("load"):
-        loaded = load_photos(files, model.config, photos)
+        loaded = load_photos(files, model.config, photos, crop=config.inference.crop)
     scene = reconstruct_photos(model, loaded.photos, config.inference, clock)
     diagnostics = diagnose_tree(scene.tree, scene.scores, scene.residual)
     warnings = [*diagnostics.warnings(), *_scene_warnings(scene, config.train.note)]
@@ -89,6 +89,15 @@ def reconstruct_folder(
 def _scene_warnings(scene: Reconstruction, note: str) -> list[str]:
     """Say what a user should not overlook."""
     warnings = [f"about these weights: {note}"] if note else []
+    cut_off = [
+        1 - window.width * window.height / (height * width)
+        for window, (height, width) in zip(scene.window, scene.cameras.image_size, strict=True)
+    ]
+    if (largest := max(cut_off)) > 0:
+        warnings.append(
+            f"inference.crop=official cut off up to {largest:.1%} of a photo "
+            f"({scene.cameras.file[cut_off.index(largest)]})"
+        )
     if missing := int((~scene.cameras.registered).sum()):
         warnings.append(f"{missing} of {len(scene.image)} images could not be registered")
     if weak := scene.point_rule.count("quantile"):

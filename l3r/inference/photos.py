@@ -1,22 +1,21 @@
-"""Photos from disk to the sizes the network takes; nothing is cropped."""
+"""Photos from disk, upright, in the form the network takes."""
 
 import io
 import logging
-import math
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
-import torch
 from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
 from l3r.config import ModelConfig
+from l3r.config.inference import Crop
 from l3r.errors import DataError
+from l3r.inference.framing import frame_photo
 from l3r.types import Photos
 
 log = logging.getLogger(__name__)
@@ -31,9 +30,9 @@ class LoadedPhotos:
     """Photos, and what became of the others."""
 
     photos: Photos
-    """Those that could be read."""
+    """Those that can be used."""
     skipped: list[tuple[str, str]] = field(default_factory=list)
-    """(file, reason) of those that could not."""
+    """(file, reason) of those that cannot."""
     upright: dict[str, bytes] = field(default_factory=dict)
     """JPEGs of photos that an EXIF flag turns, as they are shown, by file."""
 
@@ -61,35 +60,38 @@ def find_photos(folder: Path, besides: Path | None = None) -> list[Path]:
 
 
 def load_photos(
-    files: Sequence[Path], config: ModelConfig, root: Path | None = None
+    files: Sequence[Path], config: ModelConfig, root: Path | None = None, *, crop: Crop = "whole"
 ) -> LoadedPhotos:
-    """Read photos upright; those that cannot be read are named, warned of and left out.
+    """Read photos upright; those that cannot be used are named, warned of and left out.
 
     Args:
         files: Image files.
-        config: ``image_size`` and the patch: the long side becomes the network's, each side then
-            the nearest multiple of the patch.
+        config: ``image_size`` and the patch.
         root: What names are relative to; by default the files' names alone.
+        crop: How they are brought to the network's size, see
+            :class:`~l3r.config.InferenceConfig`.
 
     Raises:
-        DataError: Fewer than two photos can be read, or two have the same name.
+        DataError: Fewer than two photos can be used, or two have the same name.
     """
     names = [str(path.relative_to(root)) if root else path.name for path in files]
     if len(set(names)) < len(names):
         raise DataError(f"two photos are named {_first_repeated(names)}; rename one of them")
-    loaded = LoadedPhotos(photos=Photos(image=[], original_size=[], file=[]))
+    loaded = LoadedPhotos(photos=Photos(image=[], original_size=[], window=[], file=[]))
     for path, name in zip(files, names, strict=True):
         try:
-            image, upright = _read_upright(path)
-        except _UNREADABLE as error:
+            pixels, upright = _read_upright(path)
+            image, window = frame_photo(pixels, config, crop)
+        except _UNUSABLE as error:
             reason = f"{type(error).__name__}: {error}".split("\n")[0]
-            log.warning("%s: skipped, it cannot be read (%s)", path, reason)
+            log.warning("%s: skipped, it cannot be used (%s)", path, reason)
             loaded.skipped.append((name, reason))
             continue
         if upright is not None:
             loaded.upright[name] = upright
-        loaded.photos.image.append(_scaled(image, config))
-        loaded.photos.original_size.append((image.shape[0], image.shape[1]))
+        loaded.photos.image.append(image)
+        loaded.photos.original_size.append((pixels.shape[0], pixels.shape[1]))
+        loaded.photos.window.append(window)
         loaded.photos.file.append(name)
     require_two(loaded.photos, len(files))
     return loaded
@@ -109,16 +111,7 @@ def require_two(photos: Photos, num_found: int) -> None:
         )
 
 
-def network_size(height: int, width: int, config: ModelConfig) -> tuple[int, int]:
-    """Size (height, width) at which the network sees a photo."""
-    patch = config.encoder.patch_size
-    scale = max(config.image_size) / max(height, width)
-    # Halves go up: Python's round would send 10.5 down and 11.5 up.
-    rows, columns = (math.floor(side * scale / patch + 0.5) for side in (height, width))
-    return max(1, rows) * patch, max(1, columns) * patch
-
-
-_UNREADABLE = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
+_UNUSABLE = (OSError, ValueError, SyntaxError, Image.DecompressionBombError, DataError)
 
 
 def _read_upright(path: Path) -> tuple[UInt8[np.ndarray, "h w 3"], bytes | None]:
@@ -152,14 +145,6 @@ def _to_rgb(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
         grey = np.asarray(image, dtype=np.float64) / 257
         return np.repeat(np.clip(np.rint(grey), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
     return np.array(image.convert("RGB"))
-
-
-def _scaled(image: UInt8[np.ndarray, "h w 3"], config: ModelConfig) -> torch.Tensor:
-    height, width = network_size(image.shape[0], image.shape[1], config)
-    shrinks = height < image.shape[0] or width < image.shape[1]
-    interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
-    resized = cv2.resize(image, (width, height), interpolation=interpolation)
-    return torch.from_numpy(resized).permute(2, 0, 1).float() / 255
 
 
 def _first_repeated(names: Sequence[str]) -> str:

@@ -1,6 +1,7 @@
 """From photos to a reconstruction."""
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -18,11 +19,11 @@ from l3r.inference.decoding import (
     align_photos,
     decode_photos,
     encode_photos,
-    image_sizes,
 )
 from l3r.inference.photos import load_photos
 from l3r.inference.symmetrize import symmetrize
 from l3r.model.light3r import Light3R
+from l3r.model.precision import reduced_precision
 from l3r.types import (
     Cameras,
     PairPointmaps,
@@ -30,6 +31,7 @@ from l3r.types import (
     Reconstruction,
     SceneTree,
     Views,
+    Window,
     WorldPointmaps,
 )
 
@@ -41,7 +43,7 @@ def reconstruct(
 
     Args:
         model: From :func:`l3r.load_model`.
-        files: Image files; unreadable ones are left out with a warning.
+        files: Image files; unusable ones are left out with a warning.
         config: How; by default :class:`~l3r.config.InferenceConfig`'s values.
 
     Returns:
@@ -49,12 +51,13 @@ def reconstruct(
         root camera's frame, in metres only if the training data were metric.
 
     Raises:
-        DataError: Fewer than two photos can be read.
+        DataError: Fewer than two photos can be used.
     """
+    config = config or InferenceConfig()
     clock = StageClock(next(model.parameters()).device)
     with clock.stage("load"):
-        loaded = load_photos(files, model.config)
-    return reconstruct_photos(model, loaded.photos, config or InferenceConfig(), clock)
+        loaded = load_photos(files, model.config, crop=config.crop)
+    return reconstruct_photos(model, loaded.photos, config, clock)
 
 
 @torch.no_grad()
@@ -74,16 +77,17 @@ def reconstruct_photos(
         clock: Receives seconds and peak memory.
         scores: Ground-truth overlap, which ``graph.algorithm=oracle`` needs.
     """
-    sizes = image_sizes(photos)
-    with clock.stage("encode"):
+    sizes = photos.network_size
+    half = partial(reduced_precision, config.precision, next(model.parameters()).device)
+    with clock.stage("encode"), half():
         tokens = encode_photos(model, photos, config.chunk_size)
     with clock.stage("tree"):
         mean_tokens = torch.stack([image.mean(0) for image in tokens])
         given = None if scores is None else scores[None]
         all_scores, tree = model.connect(mean_tokens[None], given)
-    with clock.stage("align"):
+    with clock.stage("align"), half():
         aligned = align_photos(model, tokens, config.chunk_size)
-    with clock.stage("decode"):
+    with clock.stage("decode"), half():
         forward, reverse = _decode_both_ways(model, aligned, sizes, tree, config)
     with clock.stage("accumulate"):
         pairs = forward
@@ -91,9 +95,9 @@ def reconstruct_photos(
             pairs = symmetrize(forward, reverse, config.symmetrize)
         world = accumulate(pairs, tree, model.graph)
     with clock.stage("focal"):
-        K = fit_intrinsics(collect_self_views(pairs, reverse, tree), sizes, photos.original_size)
+        K = fit_intrinsics(collect_self_views(pairs, reverse, tree), photos)
     with clock.stage("cameras"):
-        fits = fit_cameras(world, K, sizes, photos.original_size, config)
+        fits = fit_cameras(world, K, photos, config)
     residual = world.residual[0].cpu()
     host_scores = all_scores[0].cpu()
     pts3d_world, conf = _unpad(world, sizes)
@@ -107,6 +111,7 @@ def reconstruct_photos(
             component=split_components(tree, host_scores, residual, model.graph),
         ),
         image=list(photos.image),
+        window=list(photos.window),
         pts3d_world=pts3d_world,
         conf=conf,
         tree=tree,
@@ -123,19 +128,33 @@ def reconstruct_views(
 ) -> Iterator[tuple[Reconstruction, Float[Tensor, "n 4 4"]]]:
     """Run the full inference path on every graph of a batch with ground truth.
 
+    Images that the batch holds transposed go in upright.
+
     Yields:
         The reconstruction of each graph and its true ``cam_from_world``, float64.
     """
     was_training = model.training
     model.eval()
-    for graph, image in enumerate(views.image):
-        size = (image.shape[-2], image.shape[-1])
-        names = [f"{view:02d}" for view in range(len(image))]
-        photos = Photos(image=list(image), original_size=[size] * len(image), file=names)
-        clock = StageClock(image.device)
+    for graph in range(len(views.image)):
+        clock = StageClock(views.image.device)
+        photos = _upright_photos(views, graph)
         scene = reconstruct_photos(model, photos, config, clock, views.scores[graph])
         yield scene, invert_rigid(views.world_from_cam[graph].double().cpu())
     model.train(was_training)
+
+
+def _upright_photos(views: Views, graph: int) -> Photos:
+    """Take a graph's images out of the training layout, each in its own orientation."""
+    sizes = [(height, width) for height, width in views.true_shape[graph].tolist()]
+    return Photos(
+        image=[
+            image if tuple(image.shape[-2:]) == size else image.mT
+            for image, size in zip(views.image[graph], sizes, strict=True)
+        ],
+        original_size=sizes,
+        window=[Window.whole(height, width) for height, width in sizes],
+        file=[f"{view:02d}" for view in range(len(sizes))],
+    )
 
 
 def _decode_both_ways(

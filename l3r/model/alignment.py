@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from l3r.config.model import AlignmentConfig
-from l3r.model.blocks import CrossAttention, EncoderBlock, Mlp, build_norm
+from l3r.model.blocks import CrossAttention, EncoderBlock, Mlp, build_norm, run_block
 
 
 class CrossBlock(nn.Module):
@@ -56,6 +56,7 @@ class LatentAlignment(nn.Module):
 
     def __init__(self, config: AlignmentConfig, width: int) -> None:
         super().__init__()
+        self.recompute = False
         is_paper = config.output == "paper"
         self.self_blocks = nn.ModuleList(
             EncoderBlock(width, config.num_heads) for _ in range(config.num_blocks)
@@ -114,6 +115,6 @@ class LatentAlignment(nn.Module):
             return tokens
         x = tokens
         for block, summaries in zip(self.cross_blocks, levels, strict=True):
-            x = block(x, summaries)
+            x = run_block(block, x, summaries, recompute=self.recompute)
         update: Tensor = x if self.out is None else self.out(x)
         return tokens + update

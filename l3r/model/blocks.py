@@ -1,8 +1,12 @@
 """Transformer layers: attention, MLP and the pre-norm blocks made of them."""
 
+from typing import Any
+
+import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from l3r.model.rope import RopeTables, apply_rope
 
@@ -68,8 +72,13 @@ class SelfAttention(nn.Module):
         Returns:
             What each token gathered, without a residual.
         """
-        q, k, v = (split_heads(part, self.num_heads) for part in self.qkv(x).chunk(3, dim=-1))
-        out: Tensor = self.proj(attend(rotate(q, rope), rotate(k, rope), v))
+        width = x.shape[-1]
+        qkv = self.qkv(x)
+        # Queries and keys turn by the same angles: in one go.
+        qk = rotate(split_heads(qkv[..., : 2 * width], 2 * self.num_heads), rope)
+        q, k = qk.chunk(2, dim=2)
+        v = split_heads(qkv[..., 2 * width :], self.num_heads)
+        out: Tensor = self.proj(attend(q, k, v))
         return out
 
 
@@ -180,22 +189,39 @@ class DecoderBlock(nn.Module):
         return out
 
 
-def split_heads(x: Float[Tensor, "m t d"], num_heads: int) -> Float[Tensor, "m {num_heads} t dim"]:
+def split_heads(x: Float[Tensor, "m t d"], num_heads: int) -> Float[Tensor, "m t heads dim"]:
     """Split channels into heads; head i is the i-th run of channels."""
-    return x.reshape(*x.shape[:2], num_heads, -1).transpose(1, 2)
+    return x.reshape(*x.shape[:2], num_heads, -1)
 
 
 def rotate(
-    x: Float[Tensor, "m heads t dim"], rope: RopeTables | None
-) -> Float[Tensor, "m heads t dim"]:
+    x: Float[Tensor, "m t heads dim"], rope: RopeTables | None
+) -> Float[Tensor, "m t heads dim"]:
     """Apply RoPE where the tokens have positions."""
     return x if rope is None else apply_rope(x, rope)
 
 
 def attend(
-    q: Float[Tensor, "m heads q dim"],
-    k: Float[Tensor, "m heads k dim"],
-    v: Float[Tensor, "m heads k dim"],
+    q: Float[Tensor, "m q heads dim"],
+    k: Float[Tensor, "m k heads dim"],
+    v: Float[Tensor, "m k heads dim"],
 ) -> Float[Tensor, "m q d"]:
     """Softmax attention, scaled by the root of the head width; heads concatenated."""
+    q, k, v = (x.transpose(1, 2) for x in (q, k, v))
     return F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2)
+
+
+def run_block(block: nn.Module, *inputs: Any, recompute: bool) -> Any:
+    """Run a block; with ``recompute`` its activations are not kept for the backward pass.
+
+    The backward pass then computes the block again: memory for one more forward pass.
+    """
+    if recompute and torch.is_grad_enabled():
+        # Nothing in a block draws random numbers.
+        return checkpoint(block, *inputs, use_reentrant=False, preserve_rng_state=False)
+    return block(*inputs)
+
+
+def at_least_float32(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Raise half precision to float32; float64 stays."""
+    return x if x.dtype == torch.float64 else x.float()

@@ -6,8 +6,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from l3r.config.model import DecoderConfig
-from l3r.model.blocks import DecoderBlock, build_linear, build_norm
-from l3r.model.rope import rope_tables
+from l3r.model.blocks import DecoderBlock, at_least_float32, build_linear, build_norm, run_block
+from l3r.model.grid import TokenGrid
 
 
 class PairDecoder(nn.Module):
@@ -25,6 +25,7 @@ class PairDecoder(nn.Module):
         super().__init__()
         self.depth = config.depth
         self.head_dim = config.width // config.num_heads
+        self.recompute = False
         self.embed = build_linear(encoder_width, config.width)
         self.parent_blocks = nn.ModuleList(
             DecoderBlock(config.width, config.num_heads) for _ in range(config.depth)
@@ -38,18 +39,18 @@ class PairDecoder(nn.Module):
         self,
         parent_tokens: Float[Tensor, "m t1 d"],
         child_tokens: Float[Tensor, "m t2 d"],
-        parent_grid: tuple[int, int],
-        child_grid: tuple[int, int],
+        parent_grid: TokenGrid,
+        child_grid: TokenGrid,
         *,
         hooks: Sequence[int] = (-1,),
     ) -> tuple[list[Float[Tensor, "m t1 _"]], list[Float[Tensor, "m t2 _"]]]:
-        """Decode edges whose parents share one shape and whose children share one.
+        """Decode edges whose parents share one token count and whose children share one.
 
         Args:
             parent_tokens: Of the parent image of each edge.
             child_tokens: Of the child image of each edge.
-            parent_grid: (rows, columns) of the parents' tokens.
-            child_grid: (rows, columns) of the children's tokens.
+            parent_grid: How the parents' tokens lie.
+            child_grid: How the children's tokens lie.
             hooks: Which entries of [tokens that came in, after block 1, .., after block depth] to
                 keep, as indices into that list; negative ones count from its end. The last entry
                 is normalised, the others are not.
@@ -57,18 +58,20 @@ class PairDecoder(nn.Module):
         Returns:
             The entries of the parent's stream and those of the child's, in the order of ``hooks``.
         """
-        parent: Tensor = self.embed(parent_tokens)
-        child: Tensor = self.embed(child_tokens)
-        parent_rope = rope_tables(*parent_grid, self.head_dim, parent)
-        child_rope = rope_tables(*child_grid, self.head_dim, child)
+        # The sums that all blocks add to stay in float32 under autocast.
+        parent = at_least_float32(self.embed(parent_tokens))
+        child = at_least_float32(self.embed(child_tokens))
+        parent_rope = parent_grid.rope(self.head_dim, parent)
+        child_rope = child_grid.rope(self.head_dim, child)
         wanted = [range(self.depth + 1)[hook] for hook in hooks]
         kept = {0: (parent_tokens, child_tokens)}
+        again = self.recompute
         blocks = zip(self.parent_blocks, self.child_blocks, strict=True)
         for index, (parent_block, child_block) in enumerate(blocks, start=1):
             # One statement, so that both streams read what the other was before this step.
             parent, child = (
-                parent_block(parent, child, parent_rope, child_rope),
-                child_block(child, parent, child_rope, parent_rope),
+                run_block(parent_block, parent, child, parent_rope, child_rope, recompute=again),
+                run_block(child_block, child, parent, child_rope, parent_rope, recompute=again),
             )
             if index in wanted:
                 kept[index] = (parent, child)

@@ -1,6 +1,7 @@
 """From decoder tokens to points and confidences."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -8,9 +9,13 @@ from torch import Tensor, nn
 from torch.nn.functional import pixel_shuffle
 
 from l3r.config.model import ModelConfig
+from l3r.model.blocks import at_least_float32, run_block
+from l3r.model.dpt import NUM_CHANNELS, DptHead
+from l3r.model.grid import TokenGrid, gather_groups
 
-NUM_CHANNELS = 4
 MIN_NORM = 1e-8
+CHUNK_TOKENS = 4096
+"""Tokens a head works on at once: five images of 384x512 in patches of 16."""
 
 
 class LinearHead(nn.Module):
@@ -34,9 +39,6 @@ class LinearHead(nn.Module):
     ) -> Float[Tensor, "m 4 h w"]:
         """Lay the outputs of all tokens out as images.
 
-        Runs in float32 outside autocast (float64 tokens stay float64): half precision shows in
-        points that are exponentials of what comes out here.
-
         Args:
             hooked: The entries named by ``hooks``: the last, normalised.
             grid: (rows, columns) of the tokens.
@@ -45,18 +47,72 @@ class LinearHead(nn.Module):
             Channels x, y, z and confidence before their activations.
         """
         (tokens,) = hooked
-        with torch.autocast(tokens.device.type, enabled=False):
-            patches = self.proj(at_least_float32(tokens))
+        patches = self.proj(tokens)
         # Channel c * patch^2 + patch * row + column of a token is channel c at that sub-pixel.
         image = patches.transpose(1, 2).reshape(*patches.shape[::2], *grid)
         return pixel_shuffle(image, self.patch_size)
 
 
-def build_head(config: ModelConfig) -> LinearHead:
+def build_head(config: ModelConfig) -> LinearHead | DptHead:
     """Build the head that a configuration names; one is needed for each stream."""
     match config.head:
         case "linear":
             return LinearHead(config.decoder.width, config.encoder.patch_size)
+        case "dpt":
+            decoder = config.decoder
+            return DptHead(config.dpt, config.encoder.width, decoder.width, decoder.depth)
+
+
+def run_head(
+    head: nn.Module, hooked: Sequence[Float[Tensor, "m t _"]], grid: TokenGrid, *, recompute: bool
+) -> Float[Tensor, "m 4 h w"]:
+    """Run a head over any number of images, a chunk of one orientation at a time.
+
+    Chunks bound the memory: a DPT head holds 0.3 GiB for each image of 384x512 that it works on. It runs in float32 outside autocast (float64 stays): half precision shows in points
+    that are exponentials of what comes out here.
+
+    Args:
+        head: What :func:`build_head` made.
+        hooked: The entries of the decoder's stream that the head asked for.
+        grid: How the tokens lie.
+        recompute: See :func:`l3r.model.blocks.run_block`.
+
+    Returns:
+        Raw channels, the pixel axes as the images are stored.
+    """
+    groups = grid.groups(len(hooked[0]))
+    results = []
+    with torch.autocast(hooked[0].device.type, enabled=False):
+        for shape, images in groups:
+            for chunk in _chunks(images, shape):
+                raw = _run_chunk(head, hooked, chunk, shape, recompute=recompute)
+                results.append(raw if shape == (grid.rows, grid.columns) else raw.transpose(2, 3))
+    return gather_groups(results, [number for _, images in groups for number in images])
+
+
+def _chunks(images: list[int], shape: tuple[int, int]) -> list[list[int]]:
+    """Cut a list of images into near-equal runs of at most ``CHUNK_TOKENS`` tokens each."""
+    count = -(-len(images) // max(1, CHUNK_TOKENS // (shape[0] * shape[1])))
+    bounds = [len(images) * part // count for part in range(count + 1)]
+    return [images[start:stop] for start, stop in pairwise(bounds)]
+
+
+def _run_chunk(
+    head: nn.Module,
+    hooked: Sequence[Tensor],
+    chunk: list[int],
+    shape: tuple[int, int],
+    *,
+    recompute: bool,
+) -> Tensor:
+    if len(chunk) == len(hooked[0]):
+        chosen = hooked
+    else:
+        index = torch.tensor(chunk).to(hooked[0].device, non_blocking=True)
+        chosen = [entry[index] for entry in hooked]
+    tokens = [at_least_float32(entry) for entry in chosen]
+    raw: Tensor = run_block(head, tokens, shape, recompute=recompute)
+    return raw
 
 
 def pointmap_from_raw(
@@ -80,8 +136,3 @@ def pointmap_from_raw(
     pts3d = xyz / norm.clamp(min=MIN_NORM) * torch.expm1(norm)
     # softplus turns linear above a threshold, which float64 can tell from the truth.
     return pts3d, torch.logaddexp(logit, torch.zeros_like(logit))
-
-
-def at_least_float32(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Raise half precision to float32; float64 stays."""
-    return x if x.dtype == torch.float64 else x.float()

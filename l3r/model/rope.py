@@ -13,12 +13,15 @@ MAX_CACHED_TABLES = 64
 
 @dataclass(frozen=True)
 class RopeTables:
-    """Cosines and sines of every token's angles; axis 1 is (row, column), axis 2 the frequency."""
+    """Factors of every token's channels; one axis of length 1 stands for the heads.
 
-    cos: Float[Tensor, "t 2 quarter"]
-    """Cosine of position times frequency."""
-    sin: Float[Tensor, "t 2 quarter"]
-    """Sine of position times frequency."""
+    Either the same for all items of a batch, or one table for each.
+    """
+
+    cos: Float[Tensor, "*items t 1 dim"]
+    """Cosine of the angle by which each channel turns."""
+    sin: Float[Tensor, "*items t 1 dim"]
+    """Sine of it, negative for the first channel of a pair."""
 
 
 def rope_tables(grid_height: int, grid_width: int, head_dim: int, like: Tensor) -> RopeTables:
@@ -40,23 +43,24 @@ def rope_tables(grid_height: int, grid_width: int, head_dim: int, like: Tensor) 
 
 
 def apply_rope(
-    q: Float[Tensor, "m heads t dim"], tables: RopeTables
-) -> Float[Tensor, "m heads t dim"]:
+    x: Float[Tensor, "m t heads dim"], tables: RopeTables
+) -> Float[Tensor, "m t heads dim"]:
     """Rotate queries or keys by their positions.
 
     The channels of a head are four equal runs [uy | vy | ux | vx]; each pair (u, v) turns by its
     angle. Dot products of rotated queries and keys depend on differences of positions alone.
 
     Args:
-        q: Queries or keys.
+        x: Queries or keys.
         tables: Of the same ``t`` tokens and head width.
 
     Returns:
-        Rotated, in the dtype of ``q``; the rotation itself runs in the dtype of the tables.
+        Rotated, in the dtype of ``x``; the rotation itself runs in the dtype of the tables.
     """
-    u, v = q.to(tables.cos.dtype).reshape(*q.shape[:3], 2, 2, -1).unbind(dim=-2)
-    turned = (u * tables.cos - v * tables.sin, v * tables.cos + u * tables.sin)
-    return torch.stack(turned, dim=-2).flatten(-3).to(q.dtype)
+    runs = x.reshape(*x.shape[:-1], 2, 2, -1)
+    # Three passes over memory in all, which is what this costs on a CPU.
+    swapped = torch.cat((runs[..., 1, :], runs[..., 0, :]), dim=-1).flatten(-2)
+    return torch.addcmul(x * tables.cos, swapped.to(tables.sin.dtype), tables.sin).to(x.dtype)
 
 
 def _build_tables(
@@ -71,7 +75,11 @@ def _build_tables(
     columns = torch.arange(grid_width, device=device, dtype=torch.float32)
     positions = torch.cartesian_prod(rows, columns)
     angles = (positions[:, :, None] * frequency).to(dtype)
-    return RopeTables(angles.cos(), angles.sin())
+    cos, sin = angles.cos(), angles.sin()
+    return RopeTables(
+        cos=torch.stack((cos, cos), dim=-2).flatten(1)[:, None],
+        sin=torch.stack((-sin, sin), dim=-2).flatten(1)[:, None],
+    )
 
 
 @lru_cache(maxsize=MAX_CACHED_TABLES)

@@ -74,6 +74,8 @@ def test_printed_yaml_loads_as_a_layer(tmp_path):
         ("train.lr=fast", "'fast'.*could not be converted to Float"),
         ("graph.knn=-1", "graph.knn is -1, expected 0 or more"),
         ("model.image_size=[50,48]", "multiples of the patch size 16"),
+        ("model.image_size=[64,48]", r"\[64, 48\], expected .*height at most width"),
+        ("inference.crop=centre", "'centre'.*official"),
         ("model.encoder.num_heads=7", "splits width 1024 into multiples of 4"),
         ("data.sources.a.weight=2", "no value for data.sources.a.shards"),
         ("nowhere.yaml", "layer nowhere.yaml: no such file"),

@@ -1,5 +1,6 @@
 """Stored graphs made by hand, and folders of shards of them."""
 
+import dataclasses
 import hashlib
 import io
 import tarfile
@@ -42,6 +43,19 @@ def make_graph(number=0, num_views=10, height=48, width=64):
         pairs=PairTable(
             iou=table, covisible=table, score=table, rotation=table, axis=table, parallax=table
         ),
+    )
+
+
+def make_mixed_graph(number=0, portrait=(False, True, True, False), height=48, width=64):
+    """A graph whose images are landscape or portrait, of the same two sides."""
+    upright = make_graph(number, len(portrait), width, height)
+    graph = make_graph(number, len(portrait), height, width)
+    chosen = [upright if turn else graph for turn in portrait]
+    return dataclasses.replace(
+        graph,
+        image=[own.image[view] for view, own in enumerate(chosen)],
+        depth=[own.depth[view] for view, own in enumerate(chosen)],
+        K=np.stack([own.K[view] for view, own in enumerate(chosen)]),
     )
 
 

@@ -18,7 +18,7 @@ from l3r.data.sampling import SampleChooser
 from l3r.data.schema import index_path
 from l3r.data.source import ShardFolder
 from l3r.errors import ConfigError, DataError
-from tests.data.graphs import make_graph, write_folder
+from tests.data.graphs import make_graph, make_mixed_graph, write_folder
 
 
 @pytest.fixture(scope="module")
@@ -114,6 +114,19 @@ def test_a_graph_is_read_in_greedy_order_and_cut_to_its_first_views(shards):
     views = read_graph(folder, 7, (16, 16))
     assert views.image.shape == (1, 3, 3, 16, 16)
     assert views.depth[0, 2, 0, 0] == 3
+
+
+def test_graphs_of_portrait_and_landscape_images_load(tmp_path):
+    ways = [(False, True, True), (True, True, True), (False, False, False), (True, False, True)]
+    graphs = [make_mixed_graph(n, ways[n], height=24, width=32) for n in range(4)]
+    data = config(write_folder(tmp_path, graphs))
+    share = DeviceShare()
+    (batch,) = build_training_loader(data, (16, 24), seed=0, num_steps=1, share=share)
+    assert batch.image.shape == (4, 3, 3, 16, 24)
+    assert batch.depth.shape == (4, 3, 16, 24)
+    for key, true_shape in zip(batch.key, batch.true_shape.tolist(), strict=True):
+        upright = ways[int(key.rpartition("-")[2])]
+        assert true_shape == [[24, 16] if portrait else [16, 24] for portrait in upright]
 
 
 def test_shards_without_an_index_are_scanned(tmp_path):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from l3r.geometry.camera import pixel_centers
+from l3r.geometry.camera import window_centers
 from l3r.geometry.rigid import invert_rigid, rigid_from_parts
-from l3r.types import Cameras, Reconstruction, SceneTree
+from l3r.types import Cameras, Reconstruction, SceneTree, Window
 
 
 def look_at(center, target):
@@ -33,9 +33,13 @@ def room_depth(origin, rays):
     return torch.where(ball.isfinite() & (ball > 0), ball, wall), ball.isfinite()
 
 
-def ring_scene(num_views=6, original=(120, 160), size=(48, 64)):
-    """Build an exact reconstruction with distinct sizes of photo and network image."""
-    views = [_view(index, num_views, original, size) for index in range(num_views)]
+def ring_scene(num_views=6, original=(120, 160), size=(48, 64), window=None):
+    """Build an exact reconstruction with distinct sizes of photo and network image.
+
+    The network saw the whole photos, or a window of each.
+    """
+    window = window or Window.whole(*original)
+    views = [_view(index / num_views, original, size, window) for index in range(num_views)]
     image, pts3d, conf, cam_from_world, K = map(list, zip(*views, strict=True))
     n = num_views
     parent = torch.tensor([[0 if child in (1, n - 1) else child - 1 for child in range(1, n)]])
@@ -67,6 +71,7 @@ def ring_scene(num_views=6, original=(120, 160), size=(48, 64)):
     return Reconstruction(
         cameras=cameras,
         image=image,
+        window=[window] * n,
         pts3d_world=pts3d,
         conf=conf,
         tree=tree,
@@ -78,15 +83,14 @@ def ring_scene(num_views=6, original=(120, 160), size=(48, 64)):
     )
 
 
-def _view(index, num_views, original, size):
-    angle = 2 * np.pi * index / num_views
+def _view(turn, original, size, window):
+    angle = 2 * np.pi * turn
     height = 0.3 * np.sin(3 * angle)
     center = torch.tensor([3 * np.cos(angle), height, 3 * np.sin(angle)]).double()
     cam_from_world = look_at(center, torch.zeros(3).double())
     focal = 0.9 * original[1]
     K = torch.tensor([[focal, 0, original[1] / 2], [0, focal, original[0] / 2], [0, 0, 1]]).double()
-    scale = torch.tensor([original[1] / size[1], original[0] / size[0]]).double()
-    pixels = pixel_centers(*size, like=K) * scale
+    pixels = window_centers(*size, window, like=K)
     rays_cam = torch.cat([pixels, torch.ones_like(pixels[:, :1])], 1) @ torch.linalg.inv(K).T
     world_from_cam = invert_rigid(cam_from_world)
     rays = rays_cam @ world_from_cam[:3, :3].T

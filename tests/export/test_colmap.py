@@ -10,6 +10,8 @@ from l3r.errors import DataError
 from l3r.export.colmap import write_colmap
 from l3r.export.colmap_read import read_colmap
 from l3r.export.points import PointSelection
+from l3r.types import Window
+from tests.export.conftest import ring_scene
 
 FEW = PointSelection(max_points=300)
 
@@ -60,6 +62,23 @@ def test_points_have_the_colour_of_their_pixel(model, scene_with_a_loss):
         x, y = observation.xy * [64 / 160, 48 / 120] - 0.5
         color = scene_with_a_loss.image[0][:, round(y), round(x)] * 255
         np.testing.assert_allclose(read.point3D(observation.point3D_id).color, color, atol=0.51)
+
+
+def test_points_of_cut_photos_stay_on_the_pixels_of_the_whole_ones(tmp_path):
+    """The network saw 80 x 60 px of 160 x 120, well off the middle."""
+    scene = ring_scene(window=Window(left=50.5, top=8.0, width=80.0, height=60.0))
+    write_colmap(tmp_path / "0", scene, FEW)
+    read = pycolmap.Reconstruction(tmp_path / "0")
+    assert read.num_points3D() == 300
+    for view, image in read.images.items():
+        for observation in image.points2D:
+            point = read.point3D(observation.point3D_id)
+            projected = image.camera.img_from_cam(image.cam_from_world() * point.xyz)
+            np.testing.assert_allclose(projected, observation.xy, atol=1e-3)
+            x, y = (observation.xy - [50.5, 8.0]) * [64 / 80, 48 / 60] - 0.5
+            color = scene.image[view - 1][:, round(y), round(x)] * 255
+            np.testing.assert_allclose(point.color, color, atol=0.51)
+        assert (image.camera.width, image.camera.height) == (160, 120)
 
 
 def test_the_same_reconstruction_gives_the_same_bytes(tmp_path, scene):

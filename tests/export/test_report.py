@@ -131,6 +131,7 @@ def test_pictures_end_at_the_limit_and_the_page_says_so(scene):
         image=(scene.image * times)[:n],
         pts3d_world=(scene.pts3d_world * times)[:n],
         conf=(scene.conf * times)[:n],
+        window=(scene.window * times)[:n],
         scores=torch.ones(n, n),
         residual=torch.zeros(n - 1),
         point_rule=["threshold"] * n,

@@ -2,7 +2,16 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from l3r.geometry.camera import crop_K, pixel_centers, project, resize_K, transpose_K, unproject
+from l3r.geometry.camera import (
+    crop_K,
+    pixel_centers,
+    project,
+    resize_K,
+    transpose_K,
+    unproject,
+    window_centers,
+)
+from l3r.types import Window
 from tests.geometry.scenes import generator, random_K
 from tests.tolerance import TOLERANCE
 
@@ -44,6 +53,17 @@ def test_cropping_shifts_every_projection(seed, left, top):
     before, _ = project(pts3d, K)
     after, _ = project(pts3d, crop_K(K, left, top))
     torch.testing.assert_close(after, before - torch.tensor([left, top], dtype=torch.float64))
+
+
+@given(SEEDS, st.floats(0, 20), st.floats(0, 20), st.floats(5, 40), st.floats(5, 40))
+def test_pixels_of_a_window_are_where_the_image_shows_the_same_points(seed, left, top, w, h):
+    """Points that the cropped and resized camera sees at its pixels, seen by the whole one."""
+    draw = generator(seed)
+    K = random_K(draw=draw)
+    seen = resize_K(crop_K(K, left, top), 8 / w, 6 / h)
+    pts2d, _ = project(unproject(depth_map(draw, 6, 8), seen), K)
+    window = Window(left=left, top=top, width=w, height=h)
+    torch.testing.assert_close(window_centers(6, 8, window, K), pts2d, atol=CLOSE, rtol=CLOSE)
 
 
 @given(SEEDS)

@@ -2,7 +2,7 @@
 
 import torch
 
-from l3r.config import AlignmentConfig, EncoderConfig, GraphConfig, ModelConfig
+from l3r.config import AlignmentConfig, DecoderConfig, EncoderConfig, GraphConfig, ModelConfig
 from l3r.geometry.camera import unproject
 from l3r.geometry.rigid import invert_rigid, transform_points
 from l3r.model.light3r import EdgePointmaps, Light3R
@@ -20,6 +20,7 @@ class OracleNetwork(Light3R):
         config = ModelConfig(
             encoder=EncoderConfig(patch_size=8, width=16, depth=1, num_heads=1),
             alignment=AlignmentConfig(num_blocks=0),
+            decoder=DecoderConfig(width=16, depth=1, num_heads=1),
             image_size=[48, 64],
         )
         super().__init__(config, graph or GraphConfig())

@@ -10,7 +10,7 @@ from l3r.inference.cameras import (
     fit_intrinsics,
     padded_pixels,
 )
-from l3r.types import PairPointmaps, WorldPointmaps
+from l3r.types import PairPointmaps, Photos, Window, WorldPointmaps
 from tests.geometry.scenes import generator
 from tests.graph.scenes import exact_scene
 
@@ -73,15 +73,28 @@ def test_self_views_of_parents_are_averaged_and_leaves_take_the_reverse():
         torch.testing.assert_close(views.pts3d_cam[view], expected)
 
 
-def test_focal_lengths_come_in_original_pixels_whatever_the_network_saw():
-    """A photo of 300 x 410 px seen at 224 x 304: sides scaled by different factors."""
+def blank_photos(original, size, window=None, count=1):
+    return Photos(
+        image=[torch.zeros(3, *size)] * count,
+        original_size=[original] * count,
+        window=[window or Window.whole(*original)] * count,
+        file=[f"{view}.jpg" for view in range(count)],
+    )
+
+
+@pytest.mark.parametrize("window", [None, Window(left=61.5, top=38.25, width=304.0, height=224.0)])
+def test_focal_lengths_come_in_original_pixels_whatever_the_network_saw(window):
+    """A photo of 300 x 410 px seen at 224 x 304: sides scaled by different factors, or cut."""
     size, original, focal = (224, 304), (300, 410), 333.0
-    pixels = padded_pixels([size], [original], torch.zeros(1, 224 * 304).double())
+    photos = blank_photos(original, size, window)
+    pixels = padded_pixels(photos, torch.zeros(1, 224 * 304).double())
+    first = [0.5 * 410 / 304, 0.5 * 300 / 224] if window is None else [62.0, 38.75]
+    assert pixels[0, 0].tolist() == pytest.approx(first)
     centered = pixels - torch.tensor([205.0, 150.0]).double()
     rays = torch.cat([centered / focal, torch.ones_like(centered[..., :1])], -1)
     depth = 1 + torch.rand(1, 224 * 304, 1, generator=generator(1), dtype=torch.float64)
     views = SelfViews(pts3d_cam=rays * depth, log_conf=torch.ones(1, 224 * 304).double())
-    (K,) = fit_intrinsics(views, [size], [original])
+    (K,) = fit_intrinsics(views, photos)
     assert K[0, 0] == K[1, 1] == pytest.approx(focal, rel=1e-6)
     assert K[:2, 2].tolist() == [205, 150]
 
@@ -95,7 +108,8 @@ def test_an_image_whose_points_are_garbage_is_not_registered():
     )
     K = torch.tensor([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]).double().expand(2, 3, 3).clone()
     K[1, 0, 0] = torch.nan
-    fits = fit_cameras(world, K, [(32, 32)] * 2, [(32, 32)] * 2, InferenceConfig())
+    photos = blank_photos((32, 32), (32, 32), count=2)
+    fits = fit_cameras(world, K, photos, InferenceConfig())
     assert fits.registered.tolist() == [False, False]
     assert fits.cam_from_world.isnan().all()
     assert fits.point_rule == ["threshold", "threshold"]

@@ -3,14 +3,12 @@ import logging
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
 
 from l3r.config import EncoderConfig, ModelConfig
 from l3r.errors import DataError
-from l3r.inference.photos import find_photos, load_photos, network_size, require_two
-from l3r.types import Photos
+from l3r.inference.photos import find_photos, load_photos, require_two
+from l3r.types import Photos, Window
 
 MODEL = ModelConfig(
     encoder=EncoderConfig(patch_size=16, width=64, depth=1, num_heads=1), image_size=[224, 224]
@@ -29,16 +27,6 @@ def save(path, height=60, width=80, exif=None, **options):
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(pixels).save(path, **extra, **options)
     return path
-
-
-@given(st.integers(1, 5000), st.integers(1, 5000))
-def test_the_network_sees_whole_photos_at_its_long_side(height, width):
-    found = network_size(height, width, MODEL)
-    assert all(side % 16 == 0 and side >= 16 for side in found)
-    assert max(found) == 224
-    scale = 224 / max(height, width)
-    for side, original in zip(found, (height, width), strict=True):
-        assert side == 16 or abs(side - original * scale) <= 8 + 1e-9
 
 
 def test_photos_of_any_shape_keep_order_size_and_orientation(tmp_path):
@@ -130,9 +118,13 @@ def test_too_few_photos_and_equal_names_are_clear_errors(tmp_path):
         load_photos([one], MODEL)
     with pytest.raises(DataError, match=r"two photos are named a\.jpg"):
         load_photos([one, save(tmp_path / "y" / "a.jpg")], MODEL)
-    require_two(
-        Photos(image=[torch.zeros(3, 4, 4)] * 2, original_size=[(4, 4)] * 2, file=["a", "b"]), 2
+    photos = Photos(
+        image=[torch.zeros(3, 4, 4)] * 2,
+        original_size=[(4, 4)] * 2,
+        window=[Window.whole(4, 4)] * 2,
+        file=["a", "b"],
     )
+    require_two(photos, 2)
 
 
 def test_a_photo_that_shrinks_in_one_direction_only_is_averaged(tmp_path):

@@ -13,15 +13,17 @@ from tests.graph.scenes import random_scores
 HEIGHT, WIDTH = 12, 16
 
 
-def random_views(seed, num_graphs=2, num_views=4, metric=True, invalid=0.2):
+def random_views(
+    seed, height=HEIGHT, width=WIDTH, *, num_graphs=2, num_views=4, metric=True, invalid=0.2
+):
     draw = generator(seed)
-    shape = (num_graphs, num_views, HEIGHT, WIDTH)
+    shape = (num_graphs, num_views, height, width)
     depth = 1 + 3 * torch.rand(shape, generator=draw, dtype=torch.float64)
     valid = torch.rand(shape, generator=draw) > invalid
     return Views(
-        image=torch.rand((num_graphs, num_views, 3, HEIGHT, WIDTH), generator=draw),
-        true_shape=torch.tensor([HEIGHT, WIDTH]).expand(num_graphs, num_views, 2),
-        K=random_K(num_graphs, num_views, draw=draw, width=WIDTH, height=HEIGHT),
+        image=torch.rand((num_graphs, num_views, 3, height, width), generator=draw),
+        true_shape=torch.tensor([height, width]).expand(num_graphs, num_views, 2),
+        K=random_K(num_graphs, num_views, draw=draw, width=width, height=height),
         world_from_cam=random_rigid(num_graphs, num_views, draw=draw),
         depth=torch.where(valid, depth, torch.zeros_like(depth)),
         valid=valid,

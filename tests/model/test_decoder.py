@@ -3,9 +3,10 @@ import torch
 
 from l3r.config.model import DecoderConfig
 from l3r.model.decoder import PairDecoder
+from l3r.model.grid import TokenGrid
 from tests.tolerance import TOLERANCE
 
-PARENT_GRID, CHILD_GRID = (2, 3), (4, 2)
+PARENT_GRID, CHILD_GRID = TokenGrid(2, 3), TokenGrid(4, 2)
 
 
 @pytest.fixture

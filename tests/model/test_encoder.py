@@ -4,6 +4,7 @@ import torch
 from l3r.config.model import EncoderConfig
 from l3r.errors import DataError
 from l3r.model.encoder import Encoder
+from l3r.model.grid import TokenGrid
 from tests.tolerance import TOLERANCE
 
 
@@ -29,7 +30,7 @@ def test_tokens_stand_row_by_row(encoder):
     image[:, :, 16:, 32:] = 1.0
     changed = (encoder.patch_embed(image) - embedded).flatten(2).abs().sum(dim=(0, 1)) > 0
     assert changed.tolist() == [False] * 5 + [True]
-    assert encoder.token_grid(32, 48) == (2, 3)
+    assert encoder.token_grid(32, 48) == TokenGrid(2, 3)
 
 
 @pytest.mark.parametrize(("height", "width"), [(40, 48), (32, 50), (0, 32), (8, 8)])

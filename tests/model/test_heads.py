@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from l3r.config.model import DecoderConfig, EncoderConfig, ModelConfig
-from l3r.model.heads import LinearHead, build_head, pointmap_from_raw
+from l3r.model.grid import TokenGrid
+from l3r.model.heads import LinearHead, build_head, pointmap_from_raw, run_head
 from tests.tolerance import TOLERANCE
 
 
@@ -27,11 +28,13 @@ def test_pixels_of_a_patch_stand_where_the_loop_puts_them():
 def test_head_ignores_autocast_and_raises_half_precision():
     torch.manual_seed(0)
     head, tokens = LinearHead(8, 4), torch.randn(2, 6, 8).bfloat16()
+    grid = TokenGrid(2, 3)
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        found = head([tokens], (2, 3))
+        found = run_head(head, [tokens], grid, recompute=False)
     assert found.dtype == torch.float32
     assert torch.equal(found, head([tokens.float()], (2, 3)))
-    assert head.double()([tokens.double()], (2, 3)).dtype == torch.float64
+    doubled = run_head(head.double(), [tokens.double()], grid, recompute=False)
+    assert doubled.dtype == torch.float64
 
 
 def test_points_and_confidence_follow_the_formulas_row_by_row():

@@ -11,8 +11,8 @@ HEAD_DIM = 16
 
 def rotated_grid(channels, grid):
     """The same vector rotated as if it stood at every token of a grid: (rows, columns, dim)."""
-    tokens = channels.expand(1, 1, grid[0] * grid[1], HEAD_DIM)
-    return apply_rope(tokens, rope_tables(*grid, HEAD_DIM, channels))[0, 0].unflatten(0, grid)
+    tokens = channels.expand(1, grid[0] * grid[1], 1, HEAD_DIM)
+    return apply_rope(tokens, rope_tables(*grid, HEAD_DIM, channels))[0, :, 0].unflatten(0, grid)
 
 
 def test_products_depend_on_differences_of_positions_alone():
@@ -46,7 +46,7 @@ def test_rotation_follows_the_written_formula():
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32, torch.float64])
 def test_rotation_keeps_lengths_and_dtype(dtype):
-    q = torch.randn(2, 3, 6, HEAD_DIM, dtype=dtype)
+    q = torch.randn(2, 6, 3, HEAD_DIM, dtype=dtype)
     tables = rope_tables(2, 3, HEAD_DIM, q)
     assert tables.cos.dtype == (torch.float64 if dtype == torch.float64 else torch.float32)
     found = apply_rope(q, tables)
@@ -64,6 +64,6 @@ def test_tables_are_made_once_for_a_shape():
 def test_tables_first_made_in_inference_mode_serve_training():
     with torch.inference_mode():
         rope_tables(11, 13, HEAD_DIM, torch.zeros(1))
-    q = torch.randn(1, 1, 11 * 13, HEAD_DIM, requires_grad=True)
+    q = torch.randn(1, 11 * 13, 1, HEAD_DIM, requires_grad=True)
     apply_rope(q, rope_tables(11, 13, HEAD_DIM, q)).sum().backward()
     assert q.grad is not None
