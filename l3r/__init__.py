@@ -1,8 +1,9 @@
 """Light3R-SfM: feed-forward Structure-from-Motion.
 
-The two functions below load torch when they are first touched, so that ``l3r --help`` is quick.
+What is named below loads torch when it is first touched, so that ``l3r --help`` is quick.
 """
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 from l3r.version import __version__
@@ -10,18 +11,19 @@ from l3r.version import __version__
 if TYPE_CHECKING:
     from l3r.inference.checkpoint import load_model
     from l3r.inference.reconstruct import reconstruct
+    from l3r.model.light3r import Light3R
 
-__all__ = ["__version__", "load_model", "reconstruct"]
+__all__ = ["Light3R", "__version__", "load_model", "reconstruct"]
+
+_HOMES = {
+    "Light3R": "l3r.model.light3r",
+    "load_model": "l3r.inference.checkpoint",
+    "reconstruct": "l3r.inference.reconstruct",
+}
 
 
 def __getattr__(name: str) -> Any:
-    """Import the public functions on first use."""
-    if name == "load_model":
-        from l3r.inference.checkpoint import load_model
-
-        return load_model
-    if name == "reconstruct":
-        from l3r.inference.reconstruct import reconstruct
-
-        return reconstruct
+    """Import a public name on first use."""
+    if name in _HOMES:
+        return getattr(importlib.import_module(_HOMES[name]), name)
     raise AttributeError(f"module 'l3r' has no attribute '{name}'")

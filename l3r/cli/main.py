@@ -15,14 +15,19 @@ COMMANDS = {
     "reconstruct": "reconstruct a folder of photos",
     "eval poses": "score cameras against trusted ones",
     "eval graphs": "score a checkpoint on validation shards",
+    "weights import": "make a checkpoint of an official DUSt3R, MASt3R or CroCo",
+    "weights inspect": "say what a file of weights is",
+    "weights download": "fetch official weights from the Hugging Face hub",
 }
 """Summary of each command; it lives in ``l3r.cli`` under its name with ``_`` for spaces."""
+GROUPS = {name.split()[0] for name in COMMANDS if " " in name}
+"""First words of commands of two."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; exit code 2 and one line on standard error if the user must act."""
     words = list(sys.argv[1:] if argv is None else argv)
-    name = " ".join(words[:2]) if words[:1] == ["eval"] else " ".join(words[:1])
+    name = " ".join(words[: 2 if words and words[0] in GROUPS else 1])
     if name not in COMMANDS:
         return _explain(words)
     # Only the command asked for is imported: the others would bring torch.
@@ -53,20 +58,13 @@ def _explain(words: Sequence[str]) -> int:
     if words[:1] == ["--version"]:
         sys.stdout.write(f"l3r {__version__}\n")
         return 0
-    asked = (
-        not words
-        or words[0] in ("-h", "--help")
-        or tuple(words[:2])
-        in (
-            ("eval", "-h"),
-            ("eval", "--help"),
-        )
-    )
-    if not asked:
+    last = words[1:2] if words[:1] and words[0] in GROUPS else words[:1]
+    if words and last not in (["-h"], ["--help"]):
         shown = " ".join(words[:2])
         sys.stderr.write(f"l3r: no command '{shown}'; expected one of: {', '.join(COMMANDS)}\n")
         return 2
-    rows = [f"  {name:<13} {summary}" for name, summary in COMMANDS.items()]
+    width = max(map(len, COMMANDS))
+    rows = [f"  {name:<{width}}  {summary}" for name, summary in COMMANDS.items()]
     sys.stdout.write(
         "usage: l3r COMMAND ...\n\nFeed-forward Structure-from-Motion.\n\n"
         + "\n".join(rows)

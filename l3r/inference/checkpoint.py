@@ -1,40 +1,30 @@
 """Checkpoints: weights and the configuration that made them, nothing else needed."""
 
-import pickle
-import struct
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from l3r.config import RunConfig, from_plain, load_config, override_config
-from l3r.errors import CheckpointError
+from l3r.config import RunConfig, from_plain, load_config, override_config, to_plain
 from l3r.model.light3r import Light3R
-
-_UNREADABLE = (
-    pickle.UnpicklingError,
-    struct.error,
-    ArithmeticError,
-    AttributeError,
-    EOFError,
-    LookupError,
-    OSError,
-    RuntimeError,
-    TypeError,
-    ValueError,
+from l3r.model.pretrained import load_exactly
+from l3r.model.weight_files import (
+    MODEL_PREFIX,
+    network_weights,
+    read_weight_file,
+    require_own,
+    write_checkpoint,
 )
-"""What torch's restricted unpickler raises on bytes that are no checkpoint."""
-MODEL_PREFIX = "model."
-"""Where the network's weights stand in a training checkpoint."""
+from l3r.version import __version__
 
 
 def load_model(path: str | Path, device: str | torch.device = "cpu") -> Light3R:
     """Load a network, ready for inference.
 
     Args:
-        path: A checkpoint written by ``l3r train``.
+        path: A checkpoint written by ``l3r train`` or ``l3r weights import``, or a folder written
+            by ``Light3R.save_pretrained``.
         device: Where the network goes.
 
     Raises:
@@ -49,7 +39,7 @@ def load_model_and_config(
     """Load a network together with the configuration of the run that trained it.
 
     Args:
-        path: A checkpoint written by ``l3r train``.
+        path: See :func:`load_model`; what a folder does not say has its default.
         device: Where the network goes.
         settings: ``inference.key=value`` and ``graph.key=value`` to change.
 
@@ -57,22 +47,11 @@ def load_model_and_config(
         CheckpointError: See :func:`load_model`.
         ConfigError: A setting cannot be used.
     """
-    checkpoint = read_checkpoint(Path(path))
+    checkpoint = read_checkpoint(Path(path), mapped=True)
     config = from_plain(checkpoint["l3r_config"], str(path))
     config = override_config(config, settings, ("inference", "graph"))
     model = Light3R(config.model, config.graph)
-    weights = {
-        key.removeprefix(MODEL_PREFIX): value
-        for key, value in checkpoint["state_dict"].items()
-        if key.startswith(MODEL_PREFIX)
-    }
-    try:
-        model.load_state_dict(weights)
-    except RuntimeError as error:
-        first = " ".join(str(error).split("\n")[1:2]).strip()
-        raise CheckpointError(
-            f"{path}: weights do not fit the configuration in the file: {first}"
-        ) from error
+    load_exactly(model, network_weights(checkpoint), str(path))
     return model.to(device).eval(), config
 
 
@@ -89,27 +68,23 @@ def build_untrained(
     return Light3R(config.model, config.graph).to(device).eval(), config
 
 
-def read_checkpoint(path: Path) -> dict[str, Any]:
+def read_checkpoint(path: Path, *, mapped: bool = False) -> dict[str, Any]:
     """Read a checkpoint without executing anything in it.
+
+    Args:
+        path: See :func:`load_model`.
+        mapped: See :func:`~l3r.model.weight_files.read_weight_file`.
 
     Raises:
         CheckpointError: The file is missing, cut off or no Light3R checkpoint.
     """
-    if not path.is_file():
-        raise CheckpointError(f"{path}: no such file; expected a checkpoint of 'l3r train'")
-    try:
-        if not zipfile.is_zipfile(path):  # torch would fall back to bare pickles
-            raise ValueError("no zip archive")
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except _UNREADABLE as error:
-        reason = str(error).split("\n")[0].split(". ")[0]
-        raise CheckpointError(
-            f"{path}: cannot be read safely ({reason}); expected a checkpoint of 'l3r train'"
-        ) from error
-    missing = {"l3r_config", "state_dict"} - set(checkpoint if isinstance(checkpoint, dict) else ())
-    if missing:
-        raise CheckpointError(
-            f"{path}: no {' and no '.join(sorted(missing))} inside; expected a checkpoint of "
-            "'l3r train'"
-        )
-    return dict(checkpoint)
+    content = read_weight_file(path, mapped=mapped)
+    require_own(content, str(path))
+    return content
+
+
+def write_model(path: Path, model: Light3R, config: RunConfig) -> None:
+    """Write weights and configuration alone, without the optimiser."""
+    weights = {MODEL_PREFIX + key: value.cpu() for key, value in model.state_dict().items()}
+    content = {"state_dict": weights, "l3r_config": to_plain(config), "l3r_version": __version__}
+    write_checkpoint(path, content)

@@ -1,26 +1,23 @@
 """Checkpoints that are whole or absent."""
 
-import io
 import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 
-from l3r.config import RunConfig, to_plain
+from l3r.config import RunConfig, from_plain, to_plain
 from l3r.errors import CheckpointError, ConfigError
-from l3r.files import write_atomic
-from l3r.inference.checkpoint import MODEL_PREFIX, read_checkpoint
-from l3r.model.light3r import Light3R
-from l3r.version import __version__
+from l3r.inference.checkpoint import read_checkpoint
+from l3r.model.weight_files import write_checkpoint
 
 FREE_TO_CHANGE = {
     "data.max_skip_rate",
     "data.num_workers",
     "train.accelerator",
     "train.checkpoint_every",
+    "train.gradient_checkpointing",
     "train.log_every",
     "train.note",
     "train.output_dir",
@@ -37,22 +34,13 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any = None
     ) -> None:
         """Write a checkpoint."""
-        target = Path(path)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(target, _to_bytes(checkpoint))
+        write_checkpoint(Path(path), checkpoint)
 
     def load_checkpoint(
         self, path: str | os.PathLike[str], map_location: Any = None, weights_only: Any = None
     ) -> dict[str, Any]:
         """Read a checkpoint without executing anything in it."""
         return read_checkpoint(Path(path))
-
-
-def write_model(path: Path, model: Light3R, config: RunConfig) -> None:
-    """Write weights and configuration alone, without the optimiser."""
-    weights = {MODEL_PREFIX + key: value.cpu() for key, value in model.state_dict().items()}
-    content = {"state_dict": weights, "l3r_config": to_plain(config), "l3r_version": __version__}
-    write_atomic(path, _to_bytes(content))
 
 
 def find_resume(checkpoint: Path, config: RunConfig) -> Path | None:
@@ -64,7 +52,9 @@ def find_resume(checkpoint: Path, config: RunConfig) -> Path | None:
     """
     if not checkpoint.exists():
         return None
-    before = _flatten(read_checkpoint(checkpoint)["l3r_config"])
+    content = read_checkpoint(checkpoint, mapped=True)
+    # Keys that are younger than the checkpoint count as their defaults.
+    before = _flatten(to_plain(from_plain(content["l3r_config"], str(checkpoint))))
     now = _flatten(to_plain(config))
     for key in sorted(before.keys() | now.keys()):
         old, new = before.get(key), now.get(key)
@@ -73,7 +63,7 @@ def find_resume(checkpoint: Path, config: RunConfig) -> Path | None:
                 f"{checkpoint}: made with {key}={old}, this run has {new}; "
                 "give that value, or another train.output_dir"
             )
-    if config.train.max_steps < read_checkpoint(checkpoint).get("global_step", 0):
+    if config.train.max_steps < content.get("global_step", 0):
         raise CheckpointError(f"{checkpoint}: is past train.max_steps={config.train.max_steps}")
     return checkpoint
 
@@ -83,12 +73,6 @@ def _is_free(key: str, config: RunConfig) -> bool:
         return config.train.schedule == "constant"
     # Shards may move, and inference is not trained.
     return key in FREE_TO_CHANGE or key.endswith(".shards") or key.startswith("inference.")
-
-
-def _to_bytes(content: Mapping[str, Any]) -> bytes:
-    stream = io.BytesIO()
-    torch.save(dict(content), stream)
-    return stream.getvalue()
 
 
 def _flatten(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

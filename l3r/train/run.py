@@ -1,6 +1,7 @@
 """One training run: parse nothing, build, fit, write."""
 
 import logging
+import sys
 import warnings
 from pathlib import Path
 
@@ -11,10 +12,12 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from l3r.config import RunConfig, to_yaml
 from l3r.errors import ConfigError
 from l3r.files import write_atomic
+from l3r.inference.checkpoint import write_model
+from l3r.inference.weights import initialise
 from l3r.loss.joint import JointLoss
 from l3r.model.light3r import Light3R
 from l3r.train.callbacks import CsvLog, GradientGuard, StepProgress, StepTimer
-from l3r.train.checkpointing import AtomicCheckpointIO, find_resume, write_model
+from l3r.train.checkpointing import AtomicCheckpointIO, find_resume
 from l3r.train.datamodule import ShardData
 from l3r.train.module import TrainModule
 
@@ -29,6 +32,7 @@ def train(config: RunConfig) -> Path:
         Path of ``model.ckpt``.
 
     Raises:
+        CheckpointError: ``init`` cannot be read or does not fit; nothing is written then.
         ConfigError: No data, or ``output_dir`` holds another run.
         DataError: The shards cannot be read.
         LaunchError: Too many bad steps in a row.
@@ -38,10 +42,15 @@ def train(config: RunConfig) -> Path:
     folder = Path(config.train.output_dir)
     last = folder / "last.ckpt"
     resume_from = find_resume(last, config)
-    folder.mkdir(parents=True, exist_ok=True)
-    write_atomic(folder / "config.yaml", to_yaml(config).encode())
     torch.manual_seed(config.train.seed)
     model = Light3R(config.model, config.graph)
+    if config.train.init and resume_from is None:
+        sys.stderr.write(initialise(model, Path(config.train.init)))
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomic(folder / "config.yaml", to_yaml(config).encode())
+    model.recompute_activations(enabled=config.train.gradient_checkpointing)
+    if config.train.compile:
+        model.compile_blocks()
     module = TrainModule(config, model, JointLoss(config.loss))
     _quieten_lightning()
     trainer = _build_trainer(config, folder)
@@ -61,6 +70,7 @@ def _build_trainer(config: RunConfig, folder: Path) -> L.Trainer:
     )
     return L.Trainer(
         accelerator=train.accelerator,
+        precision="bf16-mixed" if train.precision == "bf16" else "32-true",
         devices=1,
         max_steps=train.max_steps,
         max_epochs=-1,

@@ -5,8 +5,7 @@ import sys
 import pytest
 
 from l3r.cli.main import COMMANDS, main
-from l3r.inference.checkpoint import build_untrained
-from l3r.train.checkpointing import write_model
+from l3r.inference.checkpoint import build_untrained, write_model
 from tests.data.graphs import make_graph, write_folder
 from tests.inference.test_photos import save
 from tests.train.runs import TINY
@@ -32,11 +31,20 @@ def test_every_command_explains_itself_with_an_example(name, capsys, monkeypatch
     assert max(len(line) for line in shown.splitlines()) <= 80
 
 
-@pytest.mark.parametrize("words", [["recontruct"], ["eval"], ["eval", "pose"], ["-x"]])
+@pytest.mark.parametrize("words", [[], ["-h"], ["eval", "--help"], ["weights", "-h"]])
+def test_help_is_shown_wherever_it_is_asked_for(words, capsys):
+    assert main(words) == 0
+    assert capsys.readouterr().out.startswith("usage: l3r COMMAND")
+
+
+@pytest.mark.parametrize(
+    "words", [["recontruct"], ["eval"], ["eval", "pose"], ["-x"], ["weights"], ["weights", "impot"]]
+)
 def test_an_unknown_command_lists_the_known_ones(words, capsys):
     assert main(words) == 2
     shown = capsys.readouterr().err
-    assert "expected one of: config, train, reconstruct, eval poses, eval graphs" in shown
+    assert f"expected one of: {', '.join(COMMANDS)}" in shown
+    assert "eval graphs, weights import, weights inspect" in shown
     assert shown.count("\n") == 1
 
 

@@ -5,8 +5,12 @@ import torch
 
 import l3r
 from l3r.errors import CheckpointError, ConfigError
-from l3r.inference.checkpoint import build_untrained, load_model_and_config, read_checkpoint
-from l3r.train.checkpointing import write_model
+from l3r.inference.checkpoint import (
+    build_untrained,
+    load_model_and_config,
+    read_checkpoint,
+    write_model,
+)
 from tests.train.runs import TINY
 
 
