@@ -9,7 +9,7 @@ import sys
 
 import torch
 
-ALL = ("startup", "accumulate", "loader", "sampling")
+ALL = ("startup", "accumulate", "model", "loader", "sampling")
 
 
 def main(names: list[str]) -> int:
