@@ -68,8 +68,9 @@ def run_head(
 ) -> Float[Tensor, "m 4 h w"]:
     """Run a head over any number of images, a chunk of one orientation at a time.
 
-    Chunks bound the memory: a DPT head holds 0.3 GiB for each image of 384x512 that it works on. It runs in float32 outside autocast (float64 stays): half precision shows in points
-    that are exponentials of what comes out here.
+    Chunks bound the memory: a DPT head holds 0.3 GiB for each image of 384x512 that it works on.
+    It runs in float32 outside autocast (float64 stays): half precision shows in points that are
+    exponentials of what comes out here.
 
     Args:
         head: What :func:`build_head` made.
