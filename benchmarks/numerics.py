@@ -3,7 +3,8 @@
 python -m benchmarks.numerics --checkpoint runs/demo/tiny.ckpt --shards runs/demo/shards/val
 python -m benchmarks.numerics --model configs/model/l3r_512.yaml      # fresh weights, one pair
 
-Differences of points are shares of each point's distance from the camera.
+Differences of points are shares of each point's distance from the origin: the parent's camera for
+a pair, the root's for a scene. Scenes with an unregistered camera are left out of the differences.
 """
 
 import argparse
@@ -43,6 +44,8 @@ def main(argv: list[str]) -> int:
     if args.checkpoint is None:
         model, _ = build_untrained(["configs/base.yaml", args.model], device)
         rows = _compare_pair(model)
+    elif args.shards is None:
+        parser.error("--checkpoint needs --shards")
     else:
         model, config = load_model_and_config(args.checkpoint, device)
         rows = _compare_scenes(model, config.inference, args.shards, args.max_graphs)
@@ -86,11 +89,11 @@ def _compare_scenes(
         ((half, _),) = reconstruct_views(model, views, replace(config, precision="bf16"))
         trees.append(float(torch.equal(full.tree.parent, half.tree.parent)))
         # One tree for both: what a changed tree does is told by the accuracy below.
-        if trees[-1]:
-            both = [torch.stack(scene.pts3d_world) for scene in (half, full)]
-            points.append(_relative(*both).flatten())
-            both = [torch.stack(scene.conf).log() for scene in (half, full)]
-            conf.append((both[0] - both[1]).abs().flatten())
+        if trees[-1] and (full.cameras.registered & half.cameras.registered).all():
+            both = [_joined(scene.pts3d_world).reshape(-1, 3) for scene in (half, full)]
+            points.append(_relative(*both))
+            both = [_joined(scene.conf).log() for scene in (half, full)]
+            conf.append((both[0] - both[1]).abs())
             turned = full.cam_from_world[:, :3, :3].mT @ half.cam_from_world[:, :3, :3]
             rotations.append(rotation_angle(turned).rad2deg())
             centers.append(_center_shift(full.cam_from_world, half.cam_from_world))
@@ -103,6 +106,10 @@ def _compare_scenes(
         changed = replace(config, precision=precision)
         scores = evaluate_shards(model, changed, shards, max_graphs=max_graphs)
         print(f"{precision}: {scores.network.to_dict()}")
+
+
+def _joined(maps: list[Tensor]) -> Tensor:
+    return torch.cat([values.flatten() for values in maps])
 
 
 def _relative(found: Tensor, expected: Tensor) -> Tensor:

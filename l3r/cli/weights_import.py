@@ -1,8 +1,9 @@
 r"""``l3r weights import``.
 
 Make a Light3R checkpoint of an official DUSt3R, MASt3R or CroCo v2 file: the
-.pth, or the Hugging Face folder of config.json and model.safetensors. It
-answers for pairs of images as the original; the latent alignment is untrained.
+.pth, or the Hugging Face folder of config.json and model.safetensors. A
+DUSt3R or MASt3R answers for pairs of images as the original; the latent
+alignment is untrained. CroCo has no heads: they are fresh.
 The released weights have a licence of their own: CC BY-NC-SA 4.0,
 non-commercial.
 

@@ -70,6 +70,9 @@ def from_plain(plain: Mapping[str, Any], where: str) -> RunConfig:
     Raises:
         ConfigError: A key is unknown or a value out of range.
     """
+    # A file of weights may come from anyone: it must not have the environment read into its texts.
+    if found := _find_interpolation(plain):
+        raise ConfigError(f"{where}: {found!r} in its configuration, expected plain values")
     try:
         config = OmegaConf.merge(OmegaConf.structured(RunConfig), dict(plain))
     except OmegaConfBaseException as error:
@@ -80,6 +83,17 @@ def from_plain(plain: Mapping[str, Any], where: str) -> RunConfig:
 def to_yaml(config: RunConfig) -> str:
     """Print a configuration as YAML, in the order of its declaration."""
     return OmegaConf.to_yaml(OmegaConf.create(to_plain(config)))
+
+
+def _find_interpolation(value: object) -> str | None:
+    """Find a text that OmegaConf would fill in, anywhere in nested builtins."""
+    if isinstance(value, str):
+        return value[:80] if "${" in value else None
+    if isinstance(value, Mapping):
+        parts: Sequence[object] = [*value.keys(), *value.values()]
+    else:
+        parts = value if isinstance(value, list | tuple) else []
+    return next((found for part in parts if (found := _find_interpolation(part))), None)
 
 
 def _merge_file(config: DictConfig, layer: str) -> DictConfig:

@@ -88,7 +88,8 @@ def reconstruct_folder(
 
 def _scene_warnings(scene: Reconstruction, note: str) -> list[str]:
     """Say what a user should not overlook."""
-    warnings = [f"about these weights: {note}"] if note else []
+    shown = "".join(character for character in note if character.isprintable())
+    warnings = [f"about these weights: {shown}"] if shown else []
     cut_off = [
         1 - window.width * window.height / (height * width)
         for window, (height, width) in zip(scene.window, scene.cameras.image_size, strict=True)

@@ -73,10 +73,22 @@ def reconstruct_photos(
     Args:
         model: The network, in evaluation mode.
         photos: Two or more.
-        config: Chunks, symmetrisation and camera fitting.
+        config: Precision, chunks, symmetrisation and camera fitting.
         clock: Receives seconds and peak memory.
         scores: Ground-truth overlap, which ``graph.algorithm=oracle`` needs.
     """
+    # Validation calls this under the training's autocast, which must not reach the fits.
+    with torch.autocast(next(model.parameters()).device.type, enabled=False):
+        return _reconstruct(model, photos, config, clock, scores)
+
+
+def _reconstruct(
+    model: Light3R,
+    photos: Photos,
+    config: InferenceConfig,
+    clock: StageClock,
+    scores: Float[Tensor, "n n"] | None,
+) -> Reconstruction:
     sizes = photos.network_size
     half = partial(reduced_precision, config.precision, next(model.parameters()).device)
     with clock.stage("encode"), half():

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import torch
 
 from l3r.config import ModelConfig, RunConfig, from_plain, override_config
+from l3r.config.check import require
 from l3r.errors import CheckpointError, ConfigError
 from l3r.inference.checkpoint import write_model
 from l3r.model.light3r import Light3R
@@ -55,7 +56,10 @@ def import_official(
     seed: int = 0,
     overwrite: bool = False,
 ) -> str:
-    """Turn an official file into a Light3R checkpoint that answers for pairs as the original.
+    """Turn an official file into a Light3R checkpoint.
+
+    DUSt3R's and MASt3R's answer for pairs as the original where the alignment starts as the
+    identity (``output: zero_linear``).
 
     Args:
         path: The official file or folder.
@@ -75,6 +79,7 @@ def import_official(
     if out.is_dir() or (out.exists() and not overwrite):
         hint = "give a file name" if out.is_dir() else "take another name, or --force to replace it"
         raise ConfigError(f"--out {out}: exists already; {hint}")
+    require(0 <= seed < 2**63, "--seed", seed, "0 to 2^63 - 1")
     source = open_weights(path)
     if not source.is_official:
         raise CheckpointError(
@@ -197,11 +202,13 @@ def _import_note(source: WeightSource, transfer: Transfer, config: ModelConfig) 
     fresh = [row for row in transfer.rows if row.fate == "fresh"]
     parts = ", ".join(f"{row.part.replace('_', ' ')} ({row.remark})" for row in fresh)
     untrained = f"; untrained: {parts}" if parts else ""
-    return f"imported from {Path(source.where).name}, {source.kind}{untrained}; {source.note}"
+    name = Path(source.where).name.replace("${", "$ {")  # which would stand for a variable
+    return f"imported from {name}, {source.kind}{untrained}; {source.note}"
 
 
 def _wrap(note: str) -> str:
-    return textwrap.fill(f"about these weights: {note}", 80, break_on_hyphens=False)
+    shown = "".join(character for character in note if character.isprintable())
+    return textwrap.fill(f"about these weights: {shown}", 80, break_on_hyphens=False)
 
 
 def _blocks(config: Any) -> str:

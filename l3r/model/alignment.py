@@ -11,7 +11,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from l3r.config.model import AlignmentConfig
-from l3r.model.blocks import CrossAttention, EncoderBlock, Mlp, build_norm, run_block
+from l3r.model.blocks import (
+    CrossAttention,
+    EncoderBlock,
+    Mlp,
+    at_least_float32,
+    build_norm,
+    run_block,
+)
 
 
 class CrossBlock(nn.Module):
@@ -37,7 +44,7 @@ class CrossBlock(nn.Module):
     ) -> Float[Tensor, "b q d"]:
         """Update every token from the summaries of its graph; tokens do not see each other."""
         gathered: Tensor = self.cross_attn(self.norm1(tokens), self.norm_y(summaries))
-        x = tokens + gathered if self.attention_residual else gathered
+        x = tokens + gathered if self.attention_residual else at_least_float32(gathered)
         out: Tensor = x + self.mlp(self.norm2(x))
         return out
 

@@ -1,7 +1,5 @@
 """The dense prediction transformer's head: four stages of tokens, fused from coarse to fine."""
 
-from collections.abc import Sequence
-
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -120,13 +118,13 @@ class DptHead(nn.Module):
                 weight.data = weight.data.contiguous(memory_format=torch.channels_last)
 
     def forward(
-        self, hooked: Sequence[Float[Tensor, "m t _"]], grid: tuple[int, int]
+        self, grid: tuple[int, int], *hooked: Float[Tensor, "m t _"]
     ) -> Float[Tensor, "m 4 h w"]:
         """Compute the raw outputs of images of one shape, in their own orientation.
 
         Args:
-            hooked: The entries named by ``hooks``.
             grid: (rows, columns) of the tokens.
+            hooked: The entries named by ``hooks``.
 
         Returns:
             Channels x, y, z and confidence before their activations, 16 pixels per token.

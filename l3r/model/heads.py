@@ -35,18 +35,17 @@ class LinearHead(nn.Module):
         self.proj = nn.Linear(width, NUM_CHANNELS * patch_size**2)
 
     def forward(
-        self, hooked: Sequence[Float[Tensor, "m t d"]], grid: tuple[int, int]
+        self, grid: tuple[int, int], tokens: Float[Tensor, "m t d"]
     ) -> Float[Tensor, "m 4 h w"]:
         """Lay the outputs of all tokens out as images.
 
         Args:
-            hooked: The entries named by ``hooks``: the last, normalised.
             grid: (rows, columns) of the tokens.
+            tokens: The entry named by ``hooks``: the last, normalised.
 
         Returns:
             Channels x, y, z and confidence before their activations.
         """
-        (tokens,) = hooked
         patches = self.proj(tokens)
         # Channel c * patch^2 + patch * row + column of a token is channel c at that sub-pixel.
         image = patches.transpose(1, 2).reshape(*patches.shape[::2], *grid)
@@ -68,7 +67,8 @@ def run_head(
 ) -> Float[Tensor, "m 4 h w"]:
     """Run a head over any number of images, a chunk of one orientation at a time.
 
-    Chunks bound the memory: a DPT head holds 0.3 GiB for each image of 384x512 that it works on.
+    Chunks bound the memory where nothing is kept for a backward pass: a DPT head holds 0.3 GiB
+    for each image of 384x512 that it works on.
     It runs in float32 outside autocast (float64 stays): half precision shows in points that are
     exponentials of what comes out here.
 
@@ -106,13 +106,13 @@ def _run_chunk(
     *,
     recompute: bool,
 ) -> Tensor:
-    if len(chunk) == len(hooked[0]):
-        chosen = hooked
+    if chunk[-1] - chunk[0] == len(chunk) - 1:  # a run of images: nothing is copied
+        chosen = [entry[chunk[0] : chunk[-1] + 1] for entry in hooked]
     else:
         index = torch.tensor(chunk).to(hooked[0].device, non_blocking=True)
         chosen = [entry[index] for entry in hooked]
     tokens = [at_least_float32(entry) for entry in chosen]
-    raw: Tensor = run_block(head, tokens, shape, recompute=recompute)
+    raw: Tensor = run_block(head, shape, *tokens, recompute=recompute)
     return raw
 
 

@@ -40,7 +40,8 @@ class Pretrained(nn.Module):
             CheckpointError: There is none, it cannot be read, or it is none of ours.
         """
         path = Path(source)
-        if not path.exists() and HUB_ID.fullmatch(str(source)):
+        is_local = path.suffix in (".ckpt", ".pth") or path.parent.is_dir()
+        if not is_local and HUB_ID.fullmatch(str(source)):
             path = fetch_folder(str(source))
         content = read_weight_file(path, mapped=True)
         require_own(content, str(source))

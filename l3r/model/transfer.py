@@ -147,7 +147,7 @@ def fill_network(network: nn.Module, transfer: Transfer, source: WeightSource) -
         CheckpointError: A weight is not finite.
     """
     for key, value in transfer.weights.items():
-        if not value.float().isfinite().all():
+        if value.is_meta or not value.float().isfinite().all():
             raise CheckpointError(
                 f"{source.where}: {source.spell(key)} holds values that are not finite in float32; "
                 "fetch or write the file again"
@@ -172,6 +172,8 @@ def require_weights(content: object, where: str) -> dict[str, Tensor]:
     for key, value in content.items():
         if not isinstance(value, Tensor):
             found = f"a {type(value).__name__}"
+        elif value.is_nested:
+            found = "a nested tensor"
         elif value.layout != torch.strided or not value.is_floating_point():
             found = f"a {value.layout} tensor of {value.dtype}".replace("torch.", "")
         elif value.untyped_storage().nbytes() < value.numel() * value.element_size():

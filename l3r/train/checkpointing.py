@@ -18,6 +18,7 @@ FREE_TO_CHANGE = {
     "train.accelerator",
     "train.checkpoint_every",
     "train.gradient_checkpointing",
+    "train.init",
     "train.log_every",
     "train.note",
     "train.output_dir",

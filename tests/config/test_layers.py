@@ -140,3 +140,12 @@ def test_light_commands_never_import_torch(argv):
     done = subprocess.run([sys.executable, "-c", code, *argv], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout
+
+
+def test_a_stored_configuration_cannot_have_the_environment_read_into_it(monkeypatch):
+    monkeypatch.setenv("A_SECRET", "swordfish")
+    plain = to_plain(RunConfig())
+    plain["train"]["note"] = "see ${oc.env:A_SECRET}"
+    with pytest.raises(ConfigError, match=r"file\.ckpt.*expected plain values") as error:
+        from_plain(plain, "file.ckpt")
+    assert "swordfish" not in str(error.value)

@@ -150,3 +150,11 @@ def test_a_principal_point_outside_the_image_names_the_image():
     graph = plane_graph(48, 64, (70.0, 24.0))
     with pytest.raises(DataError, match=r"shard:key: 0-0\.png: principal point .*outside"):
         list(resize_crop([keyed(graph)], image_size=(16, 16)))
+
+
+def test_a_batch_moves_to_a_device_but_for_its_true_shapes():
+    (views,) = to_views([keyed(make_graph(num_views=2))])
+    moved = views.to("meta")
+    assert moved.true_shape.device.type == "cpu"
+    assert torch.equal(moved.true_shape, views.true_shape)
+    assert {moved.image.device.type, moved.K.device.type, moved.depth.device.type} == {"meta"}

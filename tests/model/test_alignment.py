@@ -143,3 +143,14 @@ def test_steps_follow_the_equations(output):
         x = with_mlp(gathered if output == "paper" else x + gathered, block)
     expected = start + (x if output == "paper" else x @ state["out.weight"].T)
     assert_same(alignment(tokens)[0].flatten(0, 1), expected)
+
+
+@pytest.mark.parametrize("output", ["zero_linear", "paper"])
+def test_tokens_between_blocks_stay_in_float32_under_autocast(output):
+    alignment = LatentAlignment(AlignmentConfig(num_blocks=3, num_heads=2, output=output), 16)
+    seen = []
+    for block in alignment.cross_blocks:
+        block.register_forward_hook(lambda _, __, result: seen.append(result.dtype))
+    with torch.autocast("cpu", torch.bfloat16):
+        result = alignment(torch.randn(1, 4, 6, 16))
+    assert {*seen, result.dtype} == {torch.float32}

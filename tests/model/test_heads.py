@@ -14,7 +14,7 @@ def test_pixels_of_a_patch_stand_where_the_loop_puts_them():
     patch, rows, columns = 4, 2, 3
     head = LinearHead(8, patch)
     tokens = torch.randn(2, rows * columns, 8)
-    raw, values = head([tokens], (rows, columns)), head.proj(tokens)
+    raw, values = head((rows, columns), tokens), head.proj(tokens)
     expected = torch.full((2, 4, rows * patch, columns * patch), math.nan)
     for row in range(rows * patch):
         for column in range(columns * patch):
@@ -32,7 +32,7 @@ def test_head_ignores_autocast_and_raises_half_precision():
     with torch.autocast("cpu", dtype=torch.bfloat16):
         found = run_head(head, [tokens], grid, recompute=False)
     assert found.dtype == torch.float32
-    assert torch.equal(found, head([tokens.float()], (2, 3)))
+    assert torch.equal(found, head((2, 3), tokens.float()))
     doubled = run_head(head.double(), [tokens.double()], grid, recompute=False)
     assert doubled.dtype == torch.float64
 

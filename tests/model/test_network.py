@@ -18,7 +18,7 @@ def test_every_parameter_of_the_pair_network_gets_a_gradient():
     streams = network.decoder(tokens, tokens.flip(0), grid, grid)
     loss = torch.zeros(())
     for head, stream in zip((network.parent_head, network.child_head), streams, strict=True):
-        pts3d, log_conf = pointmap_from_raw(head(stream, (2, 3)))
+        pts3d, log_conf = pointmap_from_raw(head((2, 3), *stream))
         loss = loss + pts3d.square().sum() + log_conf.sum()
     loss.backward()
     assert [name for name, value in network.named_parameters() if value.grad is None] == []

@@ -36,7 +36,9 @@ def plain(hand_shards, tmp_path_factory):
 
 
 def run(shards, folder, *settings):
-    train(load_config([*layers(shards, folder, max_steps=4), *settings]))
+    # Validation included: it runs under the training's precision.
+    changes = layers(shards, folder, max_steps=4, validate_every=2)
+    train(load_config([*changes, *settings]))
     return losses(folder)
 
 
@@ -76,6 +78,20 @@ def test_portrait_and_landscape_images_train_in_one_batch(tmp_path):
     rows = read_log(tmp_path / "run")
     assert len(rows) == 4
     assert all(float(row["grad_norm"]) > 0 for row in rows)
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+def test_inference_decides_its_own_precision_under_any_autocast(plain, hand_shards, precision):
+    model = load_model(plain / "model.ckpt")
+    views = read_graph(ShardFolder(hand_shards, 3), 0, (16, 16))
+    config = InferenceConfig(precision=precision)
+    ((outside, _),) = reconstruct_views(model, views, config)
+    with torch.autocast("cpu", torch.bfloat16):
+        ((inside, _),) = reconstruct_views(model, views, config)
+    for one, other in zip(inside.pts3d_world, outside.pts3d_world, strict=True):
+        assert torch.equal(one, other)
+    exact = {"rtol": 0, "atol": 0, "equal_nan": True}  # focal lengths of an untrained network
+    torch.testing.assert_close(inside.cameras.K, outside.cameras.K, **exact)
 
 
 @pytest.mark.slow
