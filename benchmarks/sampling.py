@@ -6,7 +6,8 @@ from functools import partial
 import torch
 
 from data_prep.converters.synthetic import intrinsics
-from data_prep.covisibility import build_table, prepare_views
+from data_prep.covisibility import build_table
+from data_prep.depth_views import prepare_views
 from data_prep.graph_sampling import sample_graphs
 from data_prep.raycast import render
 from data_prep.room import build_room, draw_cameras

@@ -10,6 +10,7 @@ from l3r.errors import L3RError
 from l3r.version import __version__
 
 COMMANDS = {
+    "inspect": "say what a folder of raw data holds, in seconds",
     "build": "turn a raw data set into shards of graphs",
     "render": "render a synthetic room into TartanAir's raw layout",
     "cameras": "write the true cameras of one raw scene",

@@ -3,56 +3,29 @@
 Depth pixels on a fixed grid of image i are moved to image j; one counts as seen there if it is
 in front, inside the image, and within 5% of the depth j has at that pixel. With c_ij the number
 of pixels of i seen in j, of n_i known ones, IoU = c / (n_i + n_j - c), c = (c_ij + c_ji) / 2.
+A scene that knows better by itself, from points triangulated in both images, gives its own IoU.
 """
 
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from data_prep.depth_views import DepthViews
 from data_prep.scene import Scene
 from l3r.errors import DataError
 from l3r.geometry.rigid import rotation_angle
 
 RELATIVE = 0.05
 """Depths that differ by less than this share are one surface."""
-METRIC_FLOOR = 0.05
-"""Depths that differ by less than this are one surface where lengths are metres [m]."""
 MIN_ROTATION = math.radians(2)
 """Below this rotation the parallax angle stands in for it [rad]."""
 
-_GRID_COLUMNS = 64
-_MIN_STRIDE = 4
-_LOOKUP_COLUMNS = 320
 _BLOCK = 2**18
 """Points tested at once: large enough to hide the calls, small enough for the cache."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class DepthViews:
-    """Depth maps of a scene, prepared for look-ups."""
-
-    pts3d_world: Float[Tensor, "n p 3"]
-    """Grid points of each view, about the scene's middle; zero where unknown."""
-    valid: Bool[Tensor, "n p"]
-    """Whether the depth of a grid point is known."""
-    pixels_from_world: Float[Tensor, "n 3 4"]
-    """Projection to pixels of ``depth``, about the scene's middle."""
-    center: Float[Tensor, "n 3"]
-    """Camera centres about the scene's middle."""
-    depth: Float[Tensor, "n h w"]
-    """z to compare with, infinite where unknown; one unknown pixel all around."""
-    floor: float
-    """Absolute tolerance of the comparison."""
-
-    @property
-    def num_views(self) -> int:
-        """Views of the scene."""
-        return len(self.center)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,61 +44,6 @@ class OverlapTable:
     """Viewpoint angle: the rotation, or the median parallax where it is below 2 degrees [rad]."""
     score: Float[Tensor, "n n"]
     """CroCo score of IoU and viewpoint angle."""
-
-
-def prepare_views(scene: Scene, device: torch.device | str = "cpu") -> DepthViews:
-    """Read a scene's depth once, thinned to what the overlap needs.
-
-    Depth to compare with keeps at most 320 columns; the grid has 64, but never more than every
-    fourth column.
-
-    Args:
-        scene: Frames of one image size.
-        device: Where to keep the tensors.
-
-    Raises:
-        DataError: A depth map cannot be read, or the frames differ in size.
-    """
-    sizes = {frame.image_size for frame in scene.frames}
-    if len(sizes) != 1:
-        raise DataError(
-            f"{scene.name}: images of sizes {sorted(sizes)}, expected one size within a scene;"
-            " split the scene"
-        )
-    height, width = sizes.pop()
-    thin = max(1, math.ceil(width / _LOOKUP_COLUMNS))
-    stride = max(_MIN_STRIDE, round(width / _GRID_COLUMNS))
-    middle = scene.world_from_cam[:, :3, 3].mean(0)
-    lookup, points, valid = [], [], []
-    rows, columns = np.meshgrid(
-        np.arange(stride // 2, height, stride), np.arange(stride // 2, width, stride), indexing="ij"
-    )
-    pixels = np.stack([columns + 0.5, rows + 0.5, np.ones_like(rows)], axis=-1).reshape(-1, 3)
-    for frame in scene.frames:
-        depth = frame.read_depth()
-        lookup.append(torch.from_numpy(depth[thin // 2 :: thin, thin // 2 :: thin].copy()))
-        z = depth[rows, columns].reshape(-1, 1).astype(np.float64)
-        cam = pixels @ np.linalg.inv(frame.K).T * z
-        world = cam @ frame.world_from_cam[:3, :3].T + (frame.world_from_cam[:3, 3] - middle)
-        points.append(torch.from_numpy(np.where(z > 0, world, 0)).float())
-        valid.append(torch.from_numpy(z[:, 0] > 0))
-    depths = torch.stack(lookup)
-    padded = torch.nn.functional.pad(
-        torch.where(depths > 0, depths, torch.inf), (1, 1, 1, 1), value=torch.inf
-    )
-    world_from_cam = torch.from_numpy(scene.world_from_cam)
-    center = world_from_cam[:, :3, 3] - torch.from_numpy(middle)
-    cam_from_world_R = world_from_cam[:, :3, :3].transpose(-1, -2)
-    cam_from_world = torch.cat([cam_from_world_R, -cam_from_world_R @ center[..., None]], dim=-1)
-    K = torch.from_numpy(scene.intrinsics / np.array([[thin], [thin], [1]]))
-    return DepthViews(
-        pts3d_world=torch.stack(points).to(device),
-        valid=torch.stack(valid).to(device),
-        pixels_from_world=(K @ cam_from_world).float().to(device),
-        center=center.float().to(device),
-        depth=padded.to(device),
-        floor=METRIC_FLOOR if scene.is_metric else 0.0,
-    )
 
 
 def _sees(
@@ -211,14 +129,19 @@ def build_table(scene: Scene, views: DepthViews) -> OverlapTable:
     """Relate all pairs of a scene.
 
     Args:
-        scene: Its cameras.
-        views: What :func:`prepare_views` made of it.
+        scene: Its cameras, and its own overlap where it has one.
+        views: What :func:`~data_prep.depth_views.prepare_views` made of it.
+
+    Raises:
+        DataError: The scene's own overlap cannot be read, or is none.
     """
     seen = count_seen(views).float()
     count = views.valid.sum(-1).float()
     common = (seen + seen.T) / 2
     iou = common / (count[:, None] + count[None, :] - common).clamp_min(1)
     iou.fill_diagonal_(1)
+    if scene.read_overlap is not None:
+        iou = _own_overlap(scene).to(iou)
     covisible = (seen / count[:, None].clamp_min(1)).fill_diagonal_(1)
     R = torch.from_numpy(scene.world_from_cam[:, :3, :3])
     rotation, axis = (table.float().to(iou.device) for table in _angles(R))
@@ -236,6 +159,19 @@ def build_table(scene: Scene, views: DepthViews) -> OverlapTable:
         angle=angle,
         score=croco_score(iou, angle),
     )
+
+
+def _own_overlap(scene: Scene) -> Float[Tensor, "n n"]:
+    assert scene.read_overlap is not None
+    iou = torch.from_numpy(scene.read_overlap())
+    n = len(scene.frames)
+    good = iou.shape == (n, n) and ((iou >= 0) & (iou <= 1)).all() and torch.equal(iou, iou.T)
+    if not (good and (iou.diagonal() == 1).all()):
+        raise DataError(
+            f"{scene.name}: its own overlap has shape {tuple(iou.shape)}, expected {n} x {n},"
+            " symmetric, from 0 to 1, and 1 on the diagonal; the source's points are damaged"
+        )
+    return iou
 
 
 def _angles(

@@ -2,10 +2,11 @@
 
 import hashlib
 import json
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from data_prep.problems import Problem
 from data_prep.scene import Scene
 from l3r.data.schema import MANIFEST_NAME, ShardEntry, index_path, read_manifest
 from l3r.errors import DataError
@@ -13,6 +14,28 @@ from l3r.files import write_atomic
 
 FOLDER = ".build"
 """Folder of the records, inside the folder of shards."""
+PROBLEMS = "problems"
+"""Key of the manifest's request that holds what was met, not what was asked."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShardRecord:
+    """A finished shard."""
+
+    entry: ShardEntry
+    """What the manifest says of it; without graphs it is not listed there."""
+    skipped: dict[str, str] = field(default_factory=dict)
+    """Graphs left out because a frame could no longer be read, by key, and why."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneRecord:
+    """A planned scene."""
+
+    num_graphs: int
+    """Graphs planned."""
+    dropped: dict[str, Problem]
+    """What is wrong with the frames left out, by name."""
 
 
 class Ledger:
@@ -53,24 +76,28 @@ class Ledger:
     def _adopt(self, request: dict[str, Any]) -> None:
         """Take the records of a folder that was copied without its hidden files."""
         manifest = read_manifest(self.out)
-        self._compare(manifest.request, request)
+        asked = {key: value for key, value in manifest.request.items() if key != PROBLEMS}
+        self._compare(asked, request)
         for entry in manifest.shards:
-            self.finish_shard(entry)
+            self.finish_shard(ShardRecord(entry=entry))
 
-    def find_shard(self, name: str) -> ShardEntry | None:
+    def find_shard(self, name: str) -> ShardRecord | None:
         """Give the record of a shard if the tar and its index are there as recorded."""
         path, shard = self.folder / f"{name}.json", self.out / name
         if not (path.is_file() and shard.is_file() and index_path(shard).is_file()):
             return None
-        entry = ShardEntry(**_read(path))
-        return entry if shard.stat().st_size == entry.bytes else None
+        plain = _read(path)
+        skipped = plain.pop("skipped", {})
+        record = ShardRecord(entry=ShardEntry(**plain), skipped=skipped)
+        return record if shard.stat().st_size == record.entry.bytes else None
 
-    def finish_shard(self, entry: ShardEntry) -> None:
+    def finish_shard(self, record: ShardRecord) -> None:
         """Record a finished shard."""
-        _write(self.folder / f"{entry.name}.json", asdict(entry))
+        entry = record.entry
+        _write(self.folder / f"{entry.name}.json", {**asdict(entry), "skipped": record.skipped})
 
-    def find_scene(self, scene: Scene) -> int | None:
-        """Give the number of graphs planned for a scene, None where it was not planned.
+    def find_scene(self, scene: Scene) -> SceneRecord | None:
+        """Give what was planned for a scene, None where it was not planned.
 
         Raises:
             DataError: The scene's frames or cameras are not those it was planned with.
@@ -84,12 +111,13 @@ class Ledger:
                 f"{self.out}: the frames or cameras of {scene.name} have changed since the build"
                 " began; restore the source, or name another --out"
             )
-        return int(record["num_graphs"])
+        dropped = {name: Problem(**plain) for name, plain in record.get("dropped", {}).items()}
+        return SceneRecord(num_graphs=int(record["num_graphs"]), dropped=dropped)
 
-    def plan_scene(self, scene: Scene, num_graphs: int) -> None:
-        """Record how many graphs a scene has."""
-        record = {"fingerprint": _fingerprint(scene), "num_graphs": num_graphs}
-        _write(self.folder / f"{scene.slug}.scene.json", record)
+    def plan_scene(self, scene: Scene, record: SceneRecord) -> None:
+        """Record what was planned for a scene, the frames left out among its frames."""
+        plain = {"fingerprint": _fingerprint(scene), **asdict(record)}
+        _write(self.folder / f"{scene.slug}.scene.json", plain)
 
 
 def _fingerprint(scene: Scene) -> str:

@@ -2,23 +2,21 @@
 
 import hashlib
 import logging
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
 from jaxtyping import Float32
 
-from data_prep.covisibility import (
-    DepthViews,
-    OverlapTable,
-    build_table,
-    median_parallax,
-    pairs_of,
-    prepare_views,
-)
+from data_prep.covisibility import OverlapTable, build_table, median_parallax, pairs_of
+from data_prep.depth_views import DepthViews, ThinView, stack_views, thin_view
+from data_prep.frames import read_image
 from data_prep.graph_sampling import SamplingOptions, sample_graphs
-from data_prep.scene import Scene
+from data_prep.problems import Problem
+from data_prep.scene import Frame, Scene
 from l3r.data.schema import PairTable
+from l3r.errors import DataError
 
 _LOG = logging.getLogger(__name__)
 
@@ -30,33 +28,99 @@ class GraphPlan:
     key: str
     """Its name in the shard."""
     views: list[int]
-    """Frames of the scene, in greedy order."""
+    """Frames of the planned scene, in greedy order."""
     pairs: PairTable
     """How they relate."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class ScenePlan:
+    """What will be stored of one scene."""
+
+    scene: Scene
+    """Its frames that can be read."""
+    graphs: list[GraphPlan]
+    """In the order drawn."""
+    dropped: dict[str, Problem]
+    """What is wrong with the frames left out, by name."""
+
+
 def plan_graphs(
-    scene: Scene, num_graphs: int, seed: int, options: SamplingOptions
-) -> list[GraphPlan]:
+    scene: Scene,
+    num_graphs: int,
+    seed: int,
+    options: SamplingOptions,
+    dropped: Mapping[str, Problem] | None = None,
+) -> ScenePlan:
     """Relate all frames of a scene and draw its graphs.
+
+    Image and depth of every frame are read once before anything is drawn, and frames that cannot
+    be read, or of whose depth nothing is known, are left out: the graphs are then complete.
 
     Args:
         scene: Frames with depth.
         num_graphs: How many graphs are wanted.
         seed: Seed of the whole build; every scene derives its own from it and its name.
         options: Thresholds of the sampler.
+        dropped: Frames left out when the scene was planned before: exactly those are left out
+            again, and the images are not read.
 
     Returns:
-        Graphs in the order drawn; fewer, with a warning, where the scene has no more.
+        The plan; with fewer graphs, and a warning, where the scene has no more.
 
     Raises:
-        DataError: Depth cannot be read.
+        DataError: The scene's own overlap is damaged, or depth that could be read when the scene
+            was planned before cannot be read now.
     """
+    found = dict(dropped or {})
     if len(scene.frames) < options.min_views:
-        found = len(scene.frames)
-        _LOG.warning("%s: %d frames, a graph has %d or more", scene.name, found, options.min_views)
-        return []
-    views = prepare_views(scene)
+        _warn_few(scene, options)
+        return ScenePlan(scene=scene, graphs=[], dropped=found)
+    thin: list[ThinView] = []
+    kept: list[int] = []
+    for number, frame in enumerate(scene.frames):
+        if dropped is not None and frame.name in dropped:
+            continue
+        view = _read_view(scene, frame, again=dropped is not None)
+        if isinstance(view, Problem):
+            found[frame.name] = view
+        else:
+            kept.append(number)
+            thin.append(view)
+    scene = scene.take(kept)
+    if len(kept) < options.min_views:
+        _warn_few(scene, options)
+        return ScenePlan(scene=scene, graphs=[], dropped=found)
+    graphs = _draw(scene, stack_views(scene, thin), num_graphs, seed, options)
+    return ScenePlan(scene=scene, graphs=graphs, dropped=found)
+
+
+def _read_view(scene: Scene, frame: Frame, *, again: bool) -> ThinView | Problem:
+    where = f"{scene.name}: {frame.name}"
+    try:
+        if not again:
+            read_image(frame)
+        view = thin_view(frame, sparse=scene.has_sparse_depth)
+    except DataError as error:
+        if again:
+            raise DataError(
+                f"{where}: has changed since the build began ({error}); restore the source, or"
+                " name another --out"
+            ) from error
+        return Problem(kind="unreadable_frame", where=where, detail=str(error))
+    if not view.valid.any():
+        return Problem(kind="empty_depth", where=where, detail="no depth is known")
+    return view
+
+
+def _warn_few(scene: Scene, options: SamplingOptions) -> None:
+    found = len(scene.frames)
+    _LOG.warning("%s: %d frames, a graph has %d or more", scene.name, found, options.min_views)
+
+
+def _draw(
+    scene: Scene, views: DepthViews, num_graphs: int, seed: int, options: SamplingOptions
+) -> list[GraphPlan]:
     table = build_table(scene, views)
     graphs = sample_graphs(
         table.iou.numpy(),
@@ -101,7 +165,7 @@ def hold_out(scene: Scene, share: float) -> tuple[Scene, Scene]:
         ``(kept, held_out)``.
     """
     cut = len(scene.frames) - round(share * len(scene.frames))
-    return replace(scene, frames=scene.frames[:cut]), replace(scene, frames=scene.frames[cut:])
+    return scene.take(range(cut)), scene.take(range(cut, len(scene.frames)))
 
 
 def _parallax_of(views: DepthViews, graphs: list[list[int]]) -> Float32[np.ndarray, "n n"]:

@@ -1,25 +1,25 @@
 """How well depth, intrinsics and cameras of two images agree: there and back again.
 
-Pixel centres of image i go to j by depth, K and cameras, and back by the depth of j. Inverse
-depth is interpolated bilinearly, which is exact on a plane, so half a pixel shows; the nearest
-pixel's depth would hide it.
+Pixel centres of image i go to j by depth, K and cameras, and back by the depth of j, interpolated
+as :mod:`data_prep.surfaces` says. The median difference with its sign is kept beside the median
+difference: noise and rounded places cancel in it, so that half a pixel shows in lidar's and
+stereo's depth as well.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
+from data_prep.surfaces import AGREE, Surface, is_scattered, surface_of
 from l3r.data.schema import GraphSample
 from l3r.geometry.camera import project
 from l3r.geometry.rigid import invert_rigid, transform_points
 
-AGREE = 0.05
-"""Depths that differ by less than this share are one surface."""
-
 _MAX_COLUMNS = 80
+_MAX_SCATTERED = 1200
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +34,8 @@ class PairMeasure:
     """Median distance from where the round trip began [px]; NaN where nothing is seen."""
     depth: float
     """Median relative difference of depth at j; NaN where nothing is seen."""
+    bias: float
+    """The same with its sign: how much farther j's surface is; NaN where nothing is seen."""
     color: float
     """Correlation of brightness at what both see; NaN where nothing is seen or all is one tone."""
 
@@ -59,21 +61,21 @@ class _View:
 
     K: Float[Tensor, "3 3"]
     cam_from_world: Float[Tensor, "4 4"]
-    depth: Float[Tensor, "h w"]
+    surface: Surface
     gray: Float[Tensor, "h w"]
     pts2d: Float[Tensor, "p 2"]
-    """Centres of known pixels on a grid."""
+    """Centres of known pixels."""
     z: Float[Tensor, " p"]
     """Their depth."""
 
     @classmethod
     def of(cls, sample: GraphSample, view: int) -> "_View":
         depth = torch.from_numpy(sample.depth[view]).double()
-        pts2d, z = _grid(depth)
+        pts2d, z = _scattered(depth) if is_scattered(depth) else _grid(depth)
         return cls(
             K=torch.from_numpy(sample.K[view]),
             cam_from_world=torch.from_numpy(sample.cam_from_world[view]),
-            depth=depth,
+            surface=surface_of(depth),
             gray=torch.from_numpy(sample.image[view]).double().mean(-1),
             pts2d=pts2d,
             z=z,
@@ -93,6 +95,13 @@ def _grid(depth: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "p 2"], Float[Tens
     return pts2d[z > 0], z[z > 0]
 
 
+def _scattered(depth: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "p 2"], Float[Tensor, " p"]]:
+    """Give centres and depth of at most 1,200 known pixels, spread evenly."""
+    where = (depth > 0).nonzero()
+    where = where[:: max(1, -(-len(where) // _MAX_SCATTERED))]
+    return where.flip(-1).to(depth.dtype) + 0.5, depth[where[:, 0], where[:, 1]]
+
+
 def lift(
     pts2d: Float[Tensor, "p 2"], z: Float[Tensor, " p"], K: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "p 3"]:
@@ -104,22 +113,24 @@ def lift(
 def _measure_pair(i: _View, j: _View, stored_covisible: float) -> PairMeasure:
     j_from_i = j.cam_from_world @ invert_rigid(i.cam_from_world)
     there, z = project(transform_points(j_from_i, lift(i.pts2d, i.z, i.K)), j.K)
-    found, known = interpolate_depth(j.depth, there)
+    found, known = j.surface.interpolate(there)
     difference = (found - z).abs() / z
     agree = known & (z > 0) & (difference < AGREE)
-    pixels = relative = color = float("nan")
+    pixels = relative = bias = color = float("nan")
     if agree.any():
         there, start = there[agree], i.pts2d[agree]
         seen = lift(there, found[agree], j.K)
         back, _ = project(transform_points(invert_rigid(j_from_i), seen), i.K)
         pixels = float((back - start).norm(dim=-1).median())
         relative = float(difference[agree].median())
+        bias = float(((found - z) / z)[agree].median())
         color = _correlate(_pick(i.gray, start), _pick(j.gray, there))
     return PairMeasure(
         stored_covisible=stored_covisible,
         share=float(agree.double().mean()),
         pixels=pixels,
         depth=relative,
+        bias=bias,
         color=color,
     )
 
@@ -134,32 +145,6 @@ def _correlate(a: Float[Tensor, " p"], b: Float[Tensor, " p"]) -> float:
     a, b = a - a.mean(), b - b.mean()
     size = float(a.norm() * b.norm())
     return float(a @ b) / size if size > 0 else float("nan")
-
-
-def interpolate_depth(
-    depth: Float[Tensor, "h w"], pts2d: Float[Tensor, "p 2"]
-) -> tuple[Float[Tensor, " p"], Bool[Tensor, " p"]]:
-    """Interpolate inverse depth bilinearly.
-
-    Args:
-        depth: z, 0 where unknown.
-        pts2d: Where to; pixel centres at .5.
-
-    Returns:
-        ``(depth, known)``: known where the four neighbours are inside, known, and agree within 5%.
-    """
-    height, width = depth.shape
-    corner = (pts2d - 0.5).nan_to_num(-1, -1, -1)
-    inside = ((corner >= 0) & (corner <= corner.new_tensor([width - 1, height - 1]))).all(-1)
-    column = corner[:, 0].clamp(0, width - 1.001).long().clamp_max(width - 2)
-    row = corner[:, 1].clamp(0, height - 1.001).long().clamp_max(height - 2)
-    four = torch.stack([depth[row + dy, column + dx] for dy in (0, 1) for dx in (0, 1)])
-    low, high = four.amin(0), four.amax(0)
-    known = inside & (low > 0) & (high <= (1 + AGREE) * low)
-    x, y = corner[:, 0] - column, corner[:, 1] - row
-    weights = torch.stack([(1 - y) * (1 - x), (1 - y) * x, y * (1 - x), y * x])
-    inverse = (weights / torch.where(known, four, 1)).sum(0)
-    return torch.where(known, 1 / inverse.clamp_min(1e-12), 0), known
 
 
 def median(values: list[float]) -> float:

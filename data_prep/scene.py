@@ -1,10 +1,13 @@
 """What a converter returns: scenes whose pixels are read frame by frame."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
+
+from l3r.errors import DataError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +40,11 @@ class Scene:
     """Whether lengths are metres."""
     frames: list[Frame]
     """In the order of the source."""
+    has_sparse_depth: bool = False
+    """Whether depth is known at scattered pixels only, as lidar gives it."""
+    read_overlap: Callable[[], Float64[np.ndarray, "n n"]] | None = None
+    """Give the overlap (IoU of shared 3-D points) of all pairs where the source knows it better
+    than depth reprojection does; 1 on the diagonal."""
 
     @property
     def slug(self) -> str:
@@ -52,3 +60,27 @@ class Scene:
     def world_from_cam(self) -> Float64[np.ndarray, "n 4 4"]:
         """Cameras of all frames."""
         return np.stack([frame.world_from_cam for frame in self.frames])
+
+    def take(self, views: Sequence[int]) -> "Scene":
+        """Keep some of the frames, and what is known of their overlap.
+
+        Args:
+            views: Numbers of the frames, in the order wanted.
+        """
+        frames = [self.frames[view] for view in views]
+        if self.read_overlap is None:
+            return replace(self, frames=frames)
+        cut = partial(_cut_overlap, self.read_overlap, self.name, len(self.frames), list(views))
+        return replace(self, frames=frames, read_overlap=cut)
+
+
+def _cut_overlap(
+    read: Callable[[], Float64[np.ndarray, "_m _m"]], name: str, num_frames: int, views: list[int]
+) -> Float64[np.ndarray, "n n"]:
+    whole = read()
+    if whole.shape != (num_frames, num_frames):
+        raise DataError(
+            f"{name}: overlap of {whole.shape} images, expected one row and column for each of"
+            f" {num_frames} frames; the source's points do not belong to its images"
+        )
+    return whole[np.ix_(views, views)]

@@ -5,9 +5,9 @@ on nothing but the request and the source, so two builds agree byte for byte.
 """
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,9 @@ from jaxtyping import Float64
 
 from data_prep.frames import FrameCache
 from data_prep.graph_sampling import SamplingOptions
-from data_prep.ledger import Ledger
-from data_prep.plan import GraphPlan, plan_graphs
+from data_prep.ledger import PROBLEMS, Ledger, SceneRecord, ShardRecord
+from data_prep.plan import GraphPlan, ScenePlan, plan_graphs
+from data_prep.problems import Problem, Problems
 from data_prep.scene import Scene
 from l3r.data.schema import (
     GraphSample,
@@ -72,8 +73,14 @@ def build_shards(
     *,
     num_workers: int = 0,
     report: Report = lambda scene, done, total: None,
+    problems: Problems | None = None,
 ) -> Manifest:
     """Write the shards of scenes, or what is missing of them, and the manifest last.
+
+    Every frame is read once before the graphs of its scene are drawn, so that one that cannot be
+    read is in none. A frame that breaks after that takes its graphs with it: they are skipped,
+    the others keep their shard and their key. A shard that loses all its graphs stays as an empty
+    tar that the manifest does not list.
 
     Args:
         scenes: All of one data set; taken one at a time.
@@ -81,61 +88,110 @@ def build_shards(
         request: What they shall hold.
         num_workers: Processes that encode; 0 encodes in this one. The bytes do not change.
         report: Told about the progress.
+        problems: Told about what is left out; the manifest gets all its counts, those of the
+            converter too.
 
     Raises:
-        DataError: The folder belongs to another request, a source file cannot be read, or no
-            scene yields a graph.
+        DataError: The folder belongs to another request, the source has changed since an
+            interrupted build, or no scene yields a graph.
     """
+    problems = Problems() if problems is None else problems
     ledger = Ledger(out, asdict(request))
+    build = _Build(ledger, request, num_workers, report, problems)
     entries: list[ShardEntry] = []
     datasets: set[str] = set()
+    slugs: dict[str, str] = {}
     for scene in scenes:
+        if slugs.setdefault(scene.slug, scene.name) != scene.name:
+            problems.add("name_clash", scene.name, f"its shards would be {slugs[scene.slug]}'s")
+            continue
         datasets.add(scene.dataset)
-        entries += _build_scene(scene, ledger, request, num_workers, report)
+        entries += build.write_scene(scene)
     if not entries:
         raise DataError(
-            f"{out}: no scene yields a graph of {request.sampling.min_views} views; look for wrong"
-            " cameras or depth, take more frames, or lower --min-views"
+            f"{out}: no scene yields a graph of {request.sampling.min_views} views (left out:"
+            f" {problems.summary()}); look for wrong cameras or depth, take more frames, or lower"
+            " --min-views"
         )
+    counts = {PROBLEMS: dict(sorted(problems.counts.items()))} if problems.counts else {}
     manifest = Manifest(
         dataset=" ".join(sorted(datasets)),
         min_views=request.sampling.min_views,
         max_views=request.sampling.max_views,
         shards=entries,
-        request=asdict(request),
+        request={**asdict(request), **counts},
     )
     write_manifest(out, manifest)
     return manifest
 
 
-def _build_scene(
-    scene: Scene, ledger: Ledger, request: BuildRequest, num_workers: int, report: Report
-) -> list[ShardEntry]:
-    num_graphs = ledger.find_scene(scene)
-    if num_graphs is not None:
-        names = _shard_names(scene, num_graphs, request)
-        found = [entry for entry in map(ledger.find_shard, names) if entry]
-        if len(found) == len(names):
-            report(scene.name, len(names), len(names))
-            return found
-    plans = plan_graphs(scene, request.num_graphs, request.seed, request.sampling)
-    ledger.plan_scene(scene, len(plans))
-    entries: dict[str, ShardEntry] = {}
-    jobs = []
-    for number, name in enumerate(_shard_names(scene, len(plans), request)):
-        first = number * request.graphs_per_shard
-        part = plans[first : first + request.graphs_per_shard]
-        entry = ledger.find_shard(name)
-        if entry:
-            entries[name] = entry
-        else:
-            jobs.append((ledger.out / name, part))
-    total = len(entries) + len(jobs)
-    for entry in _write_all(scene, jobs, num_workers):
-        ledger.finish_shard(entry)
-        entries[entry.name] = entry
-        report(scene.name, len(entries), total)
-    return [entries[name] for name in sorted(entries)]
+@dataclass(frozen=True)
+class _Build:
+    """What all scenes of a build share."""
+
+    ledger: Ledger
+    request: BuildRequest
+    num_workers: int
+    report: Report
+    problems: Problems
+
+    def write_scene(self, scene: Scene) -> list[ShardEntry]:
+        """Write what is missing of a scene's shards; give those that hold graphs."""
+        planned = self.ledger.find_scene(scene)
+        if planned is not None:
+            names = _shard_names(scene, planned.num_graphs, self.request)
+            found = [record for record in map(self.ledger.find_shard, names) if record]
+            if len(found) == len(names):
+                self._count(planned.dropped)
+                self.report(scene.name, len(names), len(names))
+                return self._finish(found)
+        plan = self._plan(scene, planned)
+        if plan is None:
+            return []
+        self._count(plan.dropped)
+        if planned is None:
+            record = SceneRecord(num_graphs=len(plan.graphs), dropped=plan.dropped)
+            self.ledger.plan_scene(scene, record)
+        return self._finish(self._write_missing(plan))
+
+    def _plan(self, scene: Scene, planned: SceneRecord | None) -> ScenePlan | None:
+        request = self.request
+        dropped = None if planned is None else planned.dropped
+        try:
+            return plan_graphs(scene, request.num_graphs, request.seed, request.sampling, dropped)
+        except DataError as error:
+            if planned is not None:
+                raise
+            self.problems.add("unusable_scene", scene.name, str(error))
+            return None
+
+    def _write_missing(self, plan: ScenePlan) -> list[ShardRecord]:
+        size = self.request.graphs_per_shard
+        records: dict[str, ShardRecord] = {}
+        jobs = []
+        for number, name in enumerate(_shard_names(plan.scene, len(plan.graphs), self.request)):
+            record = self.ledger.find_shard(name)
+            if record:
+                records[name] = record
+            else:
+                part = plan.graphs[number * size : (number + 1) * size]
+                jobs.append((self.ledger.out / name, part))
+        total = len(records) + len(jobs)
+        for record in _write_all(plan.scene, jobs, self.num_workers):
+            self.ledger.finish_shard(record)
+            records[record.entry.name] = record
+            self.report(plan.scene.name, len(records), total)
+        return [records[name] for name in sorted(records)]
+
+    def _count(self, dropped: Mapping[str, Problem]) -> None:
+        for problem in dropped.values():
+            self.problems.add(problem.kind, problem.where, problem.detail)
+
+    def _finish(self, records: list[ShardRecord]) -> list[ShardEntry]:
+        for record in records:
+            for key, detail in record.skipped.items():
+                self.problems.add("skipped_graph", key, detail)
+        return [record.entry for record in records if record.entry.num_graphs]
 
 
 def _shard_names(scene: Scene, num_graphs: int, request: BuildRequest) -> list[str]:
@@ -145,7 +201,9 @@ def _shard_names(scene: Scene, num_graphs: int, request: BuildRequest) -> list[s
 
 def _write_all(
     scene: Scene, jobs: list[tuple[Path, list[GraphPlan]]], num_workers: int
-) -> Iterator[ShardEntry]:
+) -> Iterator[ShardRecord]:
+    # The overlap has served, and may be large.
+    scene = replace(scene, read_overlap=None)
     if num_workers == 0 or len(jobs) < 2:
         cache = FrameCache(scene)
         for path, plans in jobs:
@@ -157,37 +215,44 @@ def _write_all(
             yield future.result()
 
 
-def write_shard(path: Path, cache: FrameCache, plans: list[GraphPlan]) -> ShardEntry:
+def write_shard(path: Path, cache: FrameCache, plans: list[GraphPlan]) -> ShardRecord:
     """Write one tar and its index, whole or not at all.
 
     Args:
         path: The tar.
         cache: Frames of the scene.
-        plans: Its graphs, in order.
-
-    Raises:
-        DataError: A frame cannot be read or stored.
+        plans: Its graphs, in order; one whose frames cannot be read or stored is skipped.
     """
     with atomic_path(path) as temporary:
-        index, digest = _write_tar(temporary, cache, plans)
+        index, digest, skipped = _write_tar(temporary, cache, plans)
     write_index(path, index)
-    return ShardEntry(name=path.name, num_graphs=len(plans), bytes=index.tar_bytes, sha256=digest)
+    entry = ShardEntry(
+        name=path.name, num_graphs=len(index.graphs), bytes=index.tar_bytes, sha256=digest
+    )
+    return ShardRecord(entry=entry, skipped=skipped)
 
 
-def _write_tar(path: Path, cache: FrameCache, plans: list[GraphPlan]) -> tuple[ShardIndex, str]:
-    """Write a tar; give its index and its digest."""
+def _write_tar(
+    path: Path, cache: FrameCache, plans: list[GraphPlan]
+) -> tuple[ShardIndex, str, dict[str, str]]:
+    """Write a tar; give its index, its digest and the graphs skipped."""
+    skipped: dict[str, str] = {}
     with (
         path.open("wb") as stream,
         webdataset.TarWriter(stream, encoder=False, mtime=0) as writer,
     ):
         for plan in plans:
-            members = encode_graph(_graph_sample(cache, plan), plan.key)
+            try:
+                members = encode_graph(_graph_sample(cache, plan), plan.key)
+            except DataError as error:
+                skipped[plan.key] = str(error)
+                continue
             # One by one, since a whole sample would be written in alphabetical order.
             for name, data in list(members.items())[1:]:
                 writer.write({"__key__": plan.key, name: data})
     with path.open("rb") as written:
         digest = hashlib.file_digest(written, "sha256").hexdigest()
-    return index_shard(path), digest
+    return index_shard(path), digest, skipped
 
 
 def _graph_sample(cache: FrameCache, plan: GraphPlan) -> GraphSample:

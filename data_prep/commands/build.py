@@ -2,21 +2,24 @@
 
 Relates all frames of each scene, draws graphs by the greedy rule and writes tars, indices and
 manifest.json. Interrupted, the same command goes on where it stopped; finished shards are left
-alone. A scene is a trajectory.
+alone. What cannot be read is left out, logged with its file and counted at the end and in the
+manifest. 'l3r-prep inspect' says in seconds what a folder of raw data holds.
 
-example, of each source:
+example, of a raw data set and of rendered rooms:
   l3r-prep build tartanair --raw TartanAir/ --out shards/tartanair --frame-step 4
   l3r-prep build synthetic --raw raw/room --out shards/room --num-graphs 4000 --max-views 8
 """
 
 import argparse
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from data_prep.commands.room_options import ROOM_DEFAULTS, add_room_arguments, room_request
 from data_prep.converters import CONVERTERS, read_scenes
+from data_prep.problems import Problems
 from l3r.errors import DataError
 
 if TYPE_CHECKING:
@@ -44,11 +47,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=int, default=0, metavar="N", help="seed of the draw (0)")
     add("--workers", type=int, default=0, metavar="N", help="processes that encode (0: this one)")
     raw = parser.add_argument_group("raw data sets")
-    raw.add_argument("--scenes", metavar="GLOB", help="pattern on ENV/LEVEL/PNNN (*)")
+    raw.add_argument("--scenes", metavar="GLOB", help="pattern on names as inspect lists them (*)")
     raw.add_argument(
         "--split",
         choices=["train", "test", "all"],
-        help="train leaves out DROID-SLAM's 32 test trajectories (train)",
+        help="train leaves out what is kept for testing (train)",
     )
     raw.add_argument("--frame-step", type=int, metavar="N", help="take every so many frames (1)")
     raw.add_argument(
@@ -71,8 +74,8 @@ def run(args: argparse.Namespace) -> int:
     use_one_thread()
     _refuse_foreign(args)
     parts = _synthetic_parts(args) if args.dataset == "synthetic" else _raw_parts(args)
-    for folder, scenes, num_graphs, source in parts:
-        sys.stdout.write(_build(args, folder, scenes, num_graphs, source))
+    for folder, read, num_graphs, source in parts:
+        sys.stdout.write(_build(args, folder, read, num_graphs, source))
     return 0
 
 
@@ -85,8 +88,9 @@ def _refuse_foreign(args: argparse.Namespace) -> None:
             )
 
 
-Part = tuple[Path, Iterable["Scene"], int, dict[str, Any]]
-"""Folder of shards, what goes in, graphs of each scene, options to record."""
+Read = Callable[[Problems], Iterable["Scene"]]
+Part = tuple[Path, Read, int, dict[str, Any]]
+"""Folder of shards, what reads its scenes, graphs of each scene, options to record."""
 
 
 def _raw_parts(args: argparse.Namespace) -> list[Part]:
@@ -103,20 +107,26 @@ def _raw_parts(args: argparse.Namespace) -> list[Part]:
             " 0 to less than 1 and 1 or more"
         )
 
-    def read() -> Iterable["Scene"]:
+    def read(problems: Problems) -> Iterable["Scene"]:
         return read_scenes(
             args.dataset,
             args.raw,
             source["split"],
             scenes=source["scenes"],
             frame_step=source["frame_step"],
+            problems=problems,
         )
 
     if not share:
-        return [(args.out, read(), args.num_graphs, source)]
-    kept = (hold_out(scene, share)[0] for scene in read())
-    held = (hold_out(scene, share)[1] for scene in read())
+        return [(args.out, read, args.num_graphs, source)]
     num_held = max(1, round(share * args.num_graphs))
+
+    def kept(problems: Problems) -> Iterable["Scene"]:
+        return (hold_out(scene, share)[0] for scene in read(problems))
+
+    def held(problems: Problems) -> Iterable["Scene"]:
+        return (hold_out(scene, share)[1] for scene in read(problems))
+
     return [
         (args.out / "train", kept, args.num_graphs, source),
         (args.out / "val", held, num_held, source),
@@ -131,24 +141,26 @@ def _synthetic_parts(args: argparse.Namespace) -> list[Part]:
     with show_progress() as report:
         synthetic.write_room(args.raw, request, report=report)
 
-    def read(trajectory: str) -> Iterable["Scene"]:
+    def read(trajectory: str, problems: Problems) -> Iterable["Scene"]:
         pattern = f"{request.environment}/Easy/{trajectory}"
-        return tartanair.read(args.raw, "all", scenes=pattern, dataset="synthetic")
+        return tartanair.read(
+            args.raw, "all", scenes=pattern, problems=problems, dataset="synthetic"
+        )
 
     source = {"scene_seed": request.scene_seed, "size": list(request.image_size)}
     if not request.num_held_out:
-        return [(args.out, read("P000"), args.num_graphs, source)]
+        return [(args.out, partial(read, "P000"), args.num_graphs, source)]
     num_held = max(1, round(args.num_graphs * request.num_held_out / request.num_views))
     return [
-        (args.out / "train", read("P000"), args.num_graphs, source),
-        (args.out / "val", read("P001"), num_held, source),
+        (args.out / "train", partial(read, "P000"), args.num_graphs, source),
+        (args.out / "val", partial(read, "P001"), num_held, source),
     ]
 
 
 def _build(
     args: argparse.Namespace,
     folder: Path,
-    scenes: Iterable["Scene"],
+    read: Read,
     num_graphs: int,
     source: dict[str, Any],
 ) -> str:
@@ -164,9 +176,17 @@ def _build(
         sampling=SamplingOptions(min_views=min_views, max_views=args.max_views),
         source=source,
     )
+    problems = Problems()
     with show_progress() as report:
-        manifest = build_shards(scenes, folder, request, num_workers=args.workers, report=report)
+        manifest = build_shards(
+            read(problems),
+            folder,
+            request,
+            num_workers=args.workers,
+            report=report,
+            problems=problems,
+        )
     return (
         f"{folder}: {manifest.num_graphs} graphs in {len(manifest.shards)} shards,"
-        f" {manifest.num_bytes / 1e6:.1f} MB\n"
+        f" {manifest.num_bytes / 1e6:.1f} MB; left out: {problems.summary()}\n"
     )

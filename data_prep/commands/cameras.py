@@ -7,9 +7,11 @@ example: l3r-prep cameras tartanair --raw raw/room --scenes '*/P002' --out walk.
 
 import argparse
 import sys
+from itertools import islice
 from pathlib import Path
 
 from data_prep.converters import CONVERTERS, read_scenes
+from data_prep.problems import Problems
 from l3r.errors import DataError
 
 
@@ -18,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("dataset", choices=sorted(CONVERTERS), help="layout of the source")
     add("--raw", type=Path, required=True, metavar="DIR", help="folder of the raw data")
-    add("--scenes", default="*", metavar="GLOB", help="the scene, as ENV/LEVEL/PNNN; must be one")
+    add("--scenes", default="*", metavar="GLOB", help="pattern that names one scene")
     add("--frame-step", type=int, default=1, metavar="N", help="take every so many frames (1)")
     add("--out", type=Path, required=True, metavar="FILE", help="cameras.json to write")
 
@@ -31,15 +33,22 @@ def run(args: argparse.Namespace) -> int:
     from l3r.geometry.rigid import invert_rigid
     from l3r.types import Cameras
 
+    problems = Problems()
     found = read_scenes(
-        args.dataset, args.raw, "all", scenes=args.scenes, frame_step=args.frame_step
+        args.dataset,
+        args.raw,
+        "all",
+        scenes=args.scenes,
+        frame_step=args.frame_step,
+        problems=problems,
     )
-    scenes = list(found)
-    if len(scenes) > 1:
-        names = ", ".join(scene.name for scene in scenes[:3])
+    # No more than it takes to tell: a data set may have thousands.
+    scenes = list(islice(found, 2))
+    if len(scenes) != 1:
+        names = "".join(f"{scene.name}, " for scene in scenes)
         raise DataError(
-            f"{args.raw}: {len(scenes)} scenes match '{args.scenes}' ({names}, ...), expected one;"
-            " narrow --scenes"
+            f"{args.raw}: {len(scenes) or 'no'} scenes match '{args.scenes}' ({names}...), expected"
+            " one; change --scenes"
         )
     scene = scenes[0]
     number = len(scene.frames)
@@ -53,5 +62,6 @@ def run(args: argparse.Namespace) -> int:
     )
     args.out.parent.mkdir(parents=True, exist_ok=True)
     write_cameras(args.out, cameras)
-    sys.stdout.write(f"{args.out}: {number} cameras of {scene.name}\n")
+    left_out = f"; left out: {problems.summary()}" if problems.counts else ""
+    sys.stdout.write(f"{args.out}: {number} cameras of {scene.name}{left_out}\n")
     return 0

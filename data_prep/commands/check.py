@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print what was measured; raise where it is out of range."""
-    from data_prep.check import LIMITS, MEASURED, check_shards
+    from data_prep.check import LIMITS, NOISY, check_shards
     from data_prep.commands.threads import use_one_thread
 
     use_one_thread()
@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     report = check_shards(args.shards, max_graphs=args.max_graphs, digests=args.digests)
     text = json.dumps(report.to_plain(), indent=2) if args.json else _describe(report)
     sys.stdout.write(text + "\n")
-    faults = report.find_faults(LIMITS.get(report.dataset, MEASURED))
+    faults = report.find_faults(LIMITS.get(report.dataset, NOISY))
     if faults:
         raise DataError(
             f"{args.shards}: {'; '.join(faults)}; look at the converter's intrinsics, camera"
@@ -49,6 +49,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _describe(report: "CheckReport") -> str:
+    unit = " m" if report.is_metric else ""
     rows = {
         "graphs": f"{report.num_graphs}, measured {report.num_measured}",
         "known depth": f"{report.valid_depth:.1%} of pixels",
@@ -56,8 +57,10 @@ def _describe(report: "CheckReport") -> str:
         "connected": f"{report.connected:.1%} of the pairs stored as overlapping,"
         f" {report.connected_all:.1%} of {report.num_pairs}",
         "round trip": f"{report.round_trip:.3f} px",
-        "depth": f"{report.depth_error:.4%} disagreement",
+        "depth": f"{report.depth_error:.4%} disagreement, {report.depth_bias:.4%} bias",
         "brightness": f"{report.color:.2f} correlation",
         "covisible": f"{report.covisible_gap:.3f} off the stored share",
+        "scale": f"depth {report.median_depth:.3g}{unit}, between cameras"
+        f" {report.median_step:.3g}{unit}",
     }
     return "\n".join([report.dataset, *(f"  {name:<12} {text}" for name, text in rows.items())])

@@ -1,22 +1,47 @@
 """Raw data sets and the modules that read them.
 
-To add one: write ``data_prep/converters/NAME.py`` with ``read(root, split, *, scenes, frame_step)``
-that yields scenes (see :mod:`data_prep.scene` and ``tartanair.py``), and name it below. ``build``
-and ``cameras`` then offer it. Give it limits in ``data_prep/check.py`` once they were measured.
+To add one: write a module or package ``data_prep/converters/NAME`` with these two functions, and
+name it below; ``build``, ``cameras`` and ``inspect`` then offer it::
+
+    read(root, split, *, scenes, frame_step, problems) -> Iterator[Scene]
+    survey(root) -> Iterator[SceneSurvey]
+
+``read`` streams: a scene holds cameras and names, its pixels follow frame by frame when asked for.
+What cannot be used is counted in ``problems`` and left out; DataError is for a root of which
+nothing can be read. Every convention of the source is translated there, once: K in pixels with the
+centre of the top-left pixel at (0.5, 0.5), OpenCV camera axes, ``world_from_cam`` rigid, depth z,
+0 where unknown. ``survey`` lists what is there in seconds, without pixels. Give the data set limits
+in ``data_prep/check.py`` once they were measured.
 """
 
 import importlib
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
+from data_prep.problems import Problems
 from data_prep.scene import Scene
+from data_prep.survey import SceneSurvey
 
-CONVERTERS = {"tartanair": "data_prep.converters.tartanair"}
+CONVERTERS = {
+    "tartanair": "data_prep.converters.tartanair",
+    "tartanair_v2": "data_prep.converters.tartanair_v2",
+    "waymo": "data_prep.converters.waymo",
+    "co3d": "data_prep.converters.co3d",
+    "megadepth": "data_prep.converters.megadepth",
+    "folder": "data_prep.converters.folder",
+}
 """Module of each raw data set; ``synthetic`` renders one in TartanAir's layout."""
 
 
 def read_scenes(
-    dataset: str, root: Path, split: str, *, scenes: str = "*", frame_step: int = 1
+    dataset: str,
+    root: Path,
+    split: str,
+    *,
+    scenes: str = "*",
+    frame_step: int = 1,
+    problems: Problems,
 ) -> Iterator[Scene]:
     """Read a raw data set by name.
 
@@ -26,10 +51,31 @@ def read_scenes(
         split: ``train``, ``test`` or ``all``.
         scenes: Pattern on scene names.
         frame_step: Take every so many frames.
+        problems: Told about what is left out.
 
     Raises:
-        DataError: The data cannot be read.
+        DataError: Nothing can be read.
     """
-    module = importlib.import_module(CONVERTERS[dataset])
-    found: Iterator[Scene] = module.read(root, split, scenes=scenes, frame_step=frame_step)
+    found: Iterator[Scene] = _load(dataset).read(
+        root, split, scenes=scenes, frame_step=frame_step, problems=problems
+    )
     return found
+
+
+def survey_scenes(dataset: str, root: Path) -> Iterator[SceneSurvey]:
+    """List the scenes of a raw data set by name, in seconds.
+
+    Args:
+        dataset: A key of :data:`CONVERTERS`.
+        root: Folder of the raw data.
+
+    Raises:
+        DataError: Nothing can be read.
+    """
+    found: Iterator[SceneSurvey] = _load(dataset).survey(root)
+    return found
+
+
+def _load(dataset: str) -> ModuleType:
+    """Import a converter; it alone imports what its formats need."""
+    return importlib.import_module(CONVERTERS[dataset])

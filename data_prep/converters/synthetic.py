@@ -16,7 +16,7 @@ from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from data_prep.converters.tartanair import BODY_FROM_CAM
+from data_prep.converters.trajectories import BODY_FROM_CAM
 from data_prep.raycast import render
 from data_prep.room import Room, build_room, draw_cameras, draw_walk
 from l3r.errors import DataError

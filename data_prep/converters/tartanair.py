@@ -1,36 +1,27 @@
 """TartanAir V1: ``ENV/LEVEL/PNNN/{image_left, depth_left, pose_left.txt}``.
 
-Cameras in the files are world-from-camera with body axes north, east, down; here the camera's
-axes become OpenCV's and the world stays as it is. The layout carries no intrinsics: the focal
-length is half the width and the principal point the image centre, as published for 640x480.
+Poses, axes and intrinsics: :mod:`data_prep.converters.trajectories`. Depth is ``.npy``, float32 z.
 """
 
-import struct
+import math
+import os
 from collections.abc import Iterator
-from fnmatch import fnmatch
-from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import BinaryIO
 
-import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
-from scipy.spatial.transform import Rotation
+from jaxtyping import Float32
 
-from data_prep.scene import Frame, Scene
+from data_prep.converters import trajectories
+from data_prep.converters.trajectories import Layout, Split, keep_known
+from data_prep.problems import Problems
+from data_prep.scene import Scene
+from data_prep.survey import SceneSurvey
 from l3r.errors import DataError
 
-Split = Literal["train", "test", "all"]
-
-MAX_DEPTH = 1000.0
-"""Depth beyond this is sky [m]."""
-
-BODY_FROM_CAM = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""Columns are OpenCV's x right, y down, z forward in body axes x forward, y right, z down."""
-
 HELD_OUT = frozenset(
-    f"{environment}/{level}/{name}"
-    for environment, trajectories in {
+    f"{environment}/{trajectory}"
+    for environment, held_out in {
         "abandonedfactory": "Easy/P011 Hard/P011",
         "abandonedfactory_night": "Easy/P013 Hard/P014",
         "amusement": "Easy/P008 Hard/P007",
@@ -50,12 +41,9 @@ HELD_OUT = frozenset(
         "soulcity": "Easy/P012 Hard/P009",
         "westerndesert": "Easy/P013 Hard/P007",
     }.items()
-    for level, name in (trajectory.split("/") for trajectory in trajectories.split())
+    for trajectory in held_out.split()
 )
 """The 32 trajectories DROID-SLAM keeps for testing: the public convention."""
-
-_PNG_END = b"IEND\xaeB`\x82"
-_UNIT = 1e-3
 
 
 def read(
@@ -64,6 +52,7 @@ def read(
     *,
     scenes: str = "*",
     frame_step: int = 1,
+    problems: Problems,
     dataset: str = "tartanair",
 ) -> Iterator[Scene]:
     """Find trajectories and read their cameras; pixels follow when asked for.
@@ -73,135 +62,26 @@ def read(
         split: ``train`` leaves :data:`HELD_OUT` out, ``test`` is that list, ``all`` is both.
         scenes: Pattern on ``ENV/LEVEL/PNNN``.
         frame_step: Take every so many frames.
-        dataset: Name the scenes carry; other sources write this layout too.
+        problems: Told about what is left out.
+        dataset: Name the scenes carry; the synthetic rooms come in this layout too.
 
     Yields:
         One scene per trajectory, sorted by name.
 
     Raises:
-        DataError: There is no trajectory, or one is incomplete or malformed.
+        DataError: There is no trajectory, none is asked for, or none of those can be read.
     """
-    found = {_scene_name(path): path for path in _find_trajectories(root)}
-    if not found:
-        raise DataError(
-            f"{root}: no pose_left.txt below it, expected ENV/Easy/P000/pose_left.txt as the"
-            " TartanAir archives unpack; check the folder"
-        )
-    chosen = [name for name in sorted(found) if _is_in(name, split) and fnmatch(name, scenes)]
-    if not chosen:
-        raise DataError(
-            f"{root}: none of {len(found)} trajectories ({min(found)}, ...) is in split '{split}'"
-            f" and matches '{scenes}'; change --split or --scenes"
-        )
-    for name in chosen:
-        frames = _read_trajectory(found[name], frame_step)
-        yield Scene(dataset=dataset, name=name, is_metric=True, frames=frames)
+    chosen = trajectories.choose_trajectories(root, LAYOUT, problems, split=split, scenes=scenes)
+    yield from trajectories.read_scenes(chosen, LAYOUT, problems, dataset, frame_step)
 
 
-def _find_trajectories(root: Path) -> list[Path]:
-    # A Mac leaves a '._' companion beside every file and folder it packs.
-    return [
-        path.parent
-        for path in sorted(root.rglob("pose_left.txt"))
-        if not any(part.startswith("._") for part in path.relative_to(root).parts)
-    ]
-
-
-def _scene_name(trajectory: Path) -> str:
-    """Name by the last three folders: some extractions nest ENV/ENV/LEVEL/PNNN."""
-    return "/".join(trajectory.resolve().parts[-3:])
-
-
-def _is_in(name: str, split: Split) -> bool:
-    return split == "all" or (name in HELD_OUT) == (split == "test")
-
-
-def _read_trajectory(folder: Path, frame_step: int) -> list[Frame]:
-    cameras = read_poses(folder / "pose_left.txt")
-    images = sorted(
-        path for path in (folder / "image_left").glob("*.png") if not path.name.startswith("._")
-    )
-    if len(images) != len(cameras):
-        raise DataError(
-            f"{folder}: {len(images)} images in image_left, {len(cameras)} lines in pose_left.txt,"
-            " expected one line per image; unpack the archive again"
-        )
-    frames = []
-    for index in range(0, len(images), frame_step):
-        image = folder / "image_left" / f"{index:06d}_left.png"
-        depth = folder / "depth_left" / f"{index:06d}_left_depth.npy"
-        for path in (image, depth):
-            if not path.is_file():
-                raise DataError(f"{path}: no such file; unpack the archive again")
-        frames.append(_frame(image, depth, cameras[index]))
-    return frames
-
-
-def _frame(image: Path, depth: Path, world_from_cam: Float64[np.ndarray, "4 4"]) -> Frame:
-    size = _png_size(image)
-    height, width = size
-    K = np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]], np.float64)
-    return Frame(
-        name=image.name,
-        image_size=size,
-        K=K,
-        world_from_cam=world_from_cam,
-        read_image=partial(read_png, image),
-        read_depth=partial(read_npy_depth, depth, size),
-    )
-
-
-def read_poses(path: Path) -> Float64[np.ndarray, "n 4 4"]:
-    """Read ``tx ty tz qx qy qz qw`` lines as ``world_from_cam`` with OpenCV camera axes.
+def survey(root: Path) -> Iterator[SceneSurvey]:
+    """List the trajectories, in seconds.
 
     Raises:
-        DataError: A line has not seven finite numbers or its quaternion no unit length.
+        DataError: There is none.
     """
-    rows = []
-    lines = path.read_text(encoding="utf-8").splitlines()
-    for number, line in enumerate(lines, start=1):
-        try:
-            row = [float(word) for word in line.split()]
-        except ValueError:
-            row = []
-        norm = float(np.linalg.norm(row[3:])) if len(row) == 7 else np.nan
-        if not (np.isfinite(row).all() and abs(norm - 1) < _UNIT):
-            raise DataError(
-                f"{path}:{number}: '{line[:80]}', expected 'tx ty tz qx qy qz qw' with a quaternion"
-                " of length 1; unpack the file again"
-            )
-        rows.append(row)
-    table = np.array(rows, dtype=np.float64).reshape(-1, 7)
-    cameras = np.tile(np.eye(4), (len(table), 1, 1))
-    if len(table):
-        cameras[:, :3, :3] = Rotation.from_quat(table[:, 3:]).as_matrix() @ BODY_FROM_CAM
-        cameras[:, :3, 3] = table[:, :3]
-    return cameras
-
-
-def _png_size(path: Path) -> tuple[int, int]:
-    with path.open("rb") as stream:
-        head = stream.read(24)
-    if len(head) < 24 or head[12:16] != b"IHDR":
-        raise DataError(f"{path}: no PNG; unpack the archive again")
-    width, height = struct.unpack(">II", head[16:24])
-    return height, width
-
-
-def read_png(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    """Read a PNG as RGB.
-
-    Raises:
-        DataError: It is cut off or no image.
-    """
-    data = path.read_bytes()
-    # The decoder may fill what is missing and only warn, so look for the end of the file.
-    image = None
-    if data.endswith(_PNG_END):
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    if image is None:
-        raise DataError(f"{path}: no whole PNG ({len(data)} bytes); unpack the archive again")
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+    return trajectories.survey(root, LAYOUT)
 
 
 def read_npy_depth(path: Path, image_size: tuple[int, int]) -> Float32[np.ndarray, "h w"]:
@@ -211,13 +91,38 @@ def read_npy_depth(path: Path, image_size: tuple[int, int]) -> Float32[np.ndarra
         DataError: It is cut off, or not float32 of the image's size.
     """
     try:
-        depth = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise DataError(f"{path}: no whole array ({error}); unpack the archive again") from error
-    if depth.dtype != np.float32 or depth.shape != image_size:
-        raise DataError(
-            f"{path}: {depth.dtype} of shape {depth.shape}, expected float32 of {image_size} as the"
-            " image; unpack the archive again"
-        )
-    known = np.isfinite(depth) & (depth > 0) & (depth <= MAX_DEPTH)
-    return np.where(known, depth, np.float32(0))
+        with path.open("rb") as stream:
+            header = _read_header(stream)
+            size = os.fstat(stream.fileno()).st_size - stream.tell()
+            # Before anything is allocated: a damaged header may ask for any size.
+            if header == _HEADER.format(*image_size) and size == 4 * math.prod(image_size):
+                return keep_known(np.fromfile(stream, "<f4").reshape(image_size))
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror}; check the file and its permissions") from error
+    raise DataError(
+        f"{path}: {header[:80]!r} and {size} bytes, expected a whole float32 array of"
+        f" {image_size}, row by row, as the image; unpack the archive again"
+    )
+
+
+def _read_header(stream: BinaryIO) -> str:
+    """Give the text that describes the array; numpy's own reader raises anything on damage."""
+    head = stream.read(10)
+    if len(head) < 10 or head[:8] != b"\x93NUMPY\x01\x00":
+        return "no array"
+    return stream.read(int.from_bytes(head[8:], "little")).decode("latin-1").rstrip()
+
+
+_HEADER = "{{'descr': '<f4', 'fortran_order': False, 'shape': ({}, {}), }}"
+
+LAYOUT = Layout(
+    title="TartanAir V1",
+    poses="pose_left.txt",
+    image_folder="image_left",
+    image_ending="_left.png",
+    depth_folder="depth_left",
+    depth_ending="_left_depth.npy",
+    read_depth=read_npy_depth,
+    held_out=HELD_OUT,
+)
+"""Names of its files."""

@@ -1,4 +1,5 @@
 import json
+import shutil
 import subprocess
 import sys
 
@@ -51,6 +52,22 @@ def test_a_room_is_rendered_built_and_checked(tmp_path, capsys):
     assert "room000" in out
     assert "train: 4 graphs in 1 shards" in out
     assert "val: 3 graphs" in out
+    assert out.count("left out: none") == 2
+
+
+def test_what_is_left_out_is_said_at_the_end_and_in_the_manifest(raw_room, tmp_path, capsys):
+    raw = shutil.copytree(raw_room / "room000" / "Easy" / "P000", tmp_path / "r" / "e" / "l" / "P0")
+    (raw / "depth_left" / "000002_left_depth.npy").unlink()
+    image = raw / "image_left" / "000005_left.png"
+    image.write_bytes(image.read_bytes()[:-40])
+    graphs = "--num-graphs 4 --max-views 4 --min-views 3"
+    assert run(f"build tartanair --raw {tmp_path}/r --out {tmp_path}/out {graphs}") == 0
+    assert "left out: 1 missing_depth, 1 unreadable_frame" in capsys.readouterr().out
+    counts = read_manifest(tmp_path / "out").request["problems"]
+    assert counts == {"missing_depth": 1, "unreadable_frame": 1}
+    # The same command again has nothing to do, and says the same.
+    assert run(f"build tartanair --raw {tmp_path}/r --out {tmp_path}/out {graphs}") == 0
+    assert "left out: 1 missing_depth, 1 unreadable_frame" in capsys.readouterr().out
 
 
 def test_the_last_frames_can_be_held_out(raw_room, tmp_path):
@@ -76,7 +93,8 @@ def test_true_cameras_of_one_scene_are_written(raw_room, room_scene, tmp_path):
 
 def test_cameras_of_several_scenes_are_refused(raw_room, tmp_path, capsys):
     assert run(f"cameras tartanair --raw {raw_room} --out {tmp_path}/c.json") == 2
-    assert "3 scenes match" in capsys.readouterr().err
+    message = capsys.readouterr().err
+    assert "2 scenes match '*' (room000/Easy/P000, room000/Easy/P001, ...)" in message
 
 
 @pytest.mark.parametrize(
@@ -89,6 +107,9 @@ def test_cameras_of_several_scenes_are_refused(raw_room, tmp_path, capsys):
         ("build tartanair --raw {t} --out {t}/o --held-out 1", "expected a share"),
         ("build tartanair --raw {t} --out {t}/o --max-views 1", "expected 2 <= min_views"),
         ("check {t} --max-graphs 0", "expected 1 or more"),
+        ("inspect tartanair --raw {t}/no", "no pose_left.txt below"),
+        ("inspect tartanair --raw {t} --num-graphs 0", "expected 1 or more"),
+        ("cameras tartanair --raw {t} --out {t}/c.json", "no pose_left.txt below"),
     ],
 )
 def test_a_user_error_is_one_line_and_exit_code_two(tmp_path, capsys, words, message):

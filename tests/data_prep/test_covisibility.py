@@ -8,15 +8,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from data_prep.covisibility import (
-    build_table,
-    count_seen,
-    croco_score,
-    median_parallax,
-    prepare_views,
-)
+from data_prep.converters.synthetic import intrinsics
+from data_prep.covisibility import build_table, count_seen, croco_score, median_parallax
+from data_prep.depth_views import prepare_views
+from data_prep.raycast import render
+from data_prep.room import build_room, draw_cameras
 from data_prep.scene import Frame, Scene
 from l3r.errors import DataError
+from tests.data_prep.scattered import scatter
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +90,8 @@ def wall(offset, distance=4.0, size=(48, 64), metric_depth=None):
     camera = np.eye(4)
     camera[0, 3] = offset
     depth = np.full(size, distance if metric_depth is None else metric_depth, np.float32)
-    K = np.array([[32.0, 0, 32], [0, 32, 24], [0, 0, 1]])
+    height, width = size
+    K = np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]])
     return Frame(
         name=f"{offset}.png",
         image_size=size,
@@ -168,9 +168,139 @@ def test_far_from_the_origin_nothing_changes(few):
     assert (seen - count_seen(prepare_views(few))).abs().max() <= 2
 
 
-def test_images_of_several_sizes_are_refused():
-    scene = wall_scene(wall(0.0), wall(1.0, size=(24, 32)))
-    with pytest.raises(DataError, match="expected one size"):
+@pytest.mark.parametrize(
+    "sizes", [((48, 64), (96, 128)), ((48, 64), (64, 48)), ((90, 64), (48, 200))]
+)
+def test_images_of_several_sizes_overlap_by_what_both_see(sizes):
+    # Cameras of one focal length per width, so that each sees 8 m of the wall sideways.
+    scene = wall_scene(wall(0.0, size=sizes[0]), wall(2.0, size=sizes[1]))
+    table = build_table(scene, prepare_views(scene))
+    for i, j in ((0, 1), (1, 0)):
+        points = list(grid_points(scene.frames[i], stride=4))
+        there = scene.frames[j]
+        expected = np.mean([is_seen(point, there, there.read_depth()) for point in points])
+        assert table.covisible[i, j].item() == pytest.approx(expected, abs=0.02)
+    assert 0.2 < table.iou[0, 1] < 0.8
+
+
+def test_a_scene_of_one_size_does_not_change_when_another_size_joins(few):
+    alone = build_table(few, prepare_views(few))
+    big = replace(wall(0.0, size=(240, 320)), world_from_cam=few.frames[0].world_from_cam)
+    joined = replace(few, frames=[*few.frames, big])
+    table = build_table(joined, prepare_views(joined))
+    torch.testing.assert_close(table.iou[:6, :6], alone.iou)
+    torch.testing.assert_close(table.covisible[:6, :6], alone.covisible)
+
+
+def test_a_very_tall_image_is_thinned_along_its_height():
+    frame = wall(0.0, size=(3200, 400))
+    views = prepare_views(wall_scene(frame, wall(0.5, size=(3200, 400))))
+    assert views.depth.shape[1:] == (3200 // 5 + 2, 400 // 5 + 2)
+    assert views.pts3d_world.shape[1] == (3200 // 25) * (400 // 25)
+
+
+def compare(scene, scattered):
+    """Overlap of all pairs, from all of the depth and from what was kept of it."""
+    off = ~torch.eye(len(scene.frames), dtype=torch.bool)
+    tables = [build_table(each, prepare_views(each)) for each in (scene, scattered)]
+    return [torch.stack([table.iou[off], table.covisible[off]]) for table in tables]
+
+
+def test_scattered_depth_gives_the_overlap_of_the_whole(few):
+    # Here the grid is as fine as what is known; the next test has the sizes of genuine images.
+    whole, found = compare(few, scatter(few, "waymo", share=0.15))
+    assert (found - whole).abs().mean() < 0.03
+    assert (found - whole).abs().max() < 0.15
+    assert (whole[0] > 0.2).any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("share", "low"), [(0.07, 0.02), (0.01, 0.04)])
+def test_at_the_size_of_genuine_images_the_overlap_is_close_and_orders_pairs_alike(share, low):
+    room, size = build_room(3), (480, 640)
+    cameras = draw_cameras(room, 12, seed=1)
+    K = intrinsics(size)
+    frames = []
+    for camera in cameras:
+        _, depth = render(room, torch.from_numpy(K), camera[None], size)
+        frames.append(
+            replace(
+                wall(0.0, size=size),
+                K=K,
+                world_from_cam=camera.numpy(),
+                read_depth=partial(np.asarray, depth[0].numpy()),
+            )
+        )
+    scene = wall_scene(*frames)
+    whole, found = compare(scene, scatter(scene, "waymo", share=share))
+    seen = whole[0] > 0.05
+    assert -low < (found - whole)[0, seen].mean() < 0.005
+    assert np.corrcoef(whole[0], found[0])[0, 1] > 0.998
+
+
+def test_an_image_of_scattered_depth_sees_its_own_points(few):
+    scene = scatter(few, "waymo", share=0.15)
+    views = prepare_views(scene)
+    share = count_seen(views).diagonal() / views.valid.sum(-1)
+    assert (share > 0.97).all()
+    # One point at most from each cell of four by four pixels, of those that are known.
+    depth = scene.frames[0].read_depth()
+    cells = depth.reshape(30, 4, 40, 4).max((1, 3)) > 0
+    assert views.valid[0].sum() == cells.sum()
+
+
+def test_scattered_depth_says_nothing_far_from_where_it_is_known():
+    scene = wall_scene(wall(0.0, size=(480, 640)), wall(0.0, size=(480, 640)))
+    half = np.zeros((480, 640), np.float32)
+    half[::7, 0:320:5] = 4.0
+    frames = [scene.frames[0], replace(scene.frames[1], read_depth=lambda: half)]
+    scene = replace(scene, frames=frames, has_sparse_depth=True)
+    table = build_table(scene, prepare_views(scene))
+    assert table.covisible[0, 1].item() == pytest.approx(0.5 + 16 / 640, abs=0.02)
+    assert table.covisible[1, 0].item() == pytest.approx(1, abs=0.01)
+
+
+def overlap_of(scene, value):
+    n = len(scene.frames)
+    return replace(scene, read_overlap=lambda: np.full((n, n), value) + (1 - value) * np.eye(n))
+
+
+def test_the_overlap_a_scene_knows_itself_takes_the_place_of_reprojection(few, table):
+    own = overlap_of(few, 0.25)
+    found = build_table(own, prepare_views(own))
+    assert (found.iou[~torch.eye(6, dtype=torch.bool)] == 0.25).all()
+    torch.testing.assert_close(found.covisible, table.covisible)
+    torch.testing.assert_close(found.score, croco_score(found.iou, found.angle))
+
+
+def test_the_overlap_follows_the_frames_that_are_kept(few):
+    draw = np.random.default_rng(0).random((6, 6))
+    whole = (draw + draw.T) / 2
+    np.fill_diagonal(whole, 1)
+    scene = replace(few, read_overlap=lambda: whole).take([4, 1, 3])
+    np.testing.assert_array_equal(scene.take([0, 2]).read_overlap(), whole[np.ix_([4, 3], [4, 3])])
+    assert [frame.name for frame in scene.frames] == [few.frames[k].name for k in (4, 1, 3)]
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda n: np.eye(n - 1),
+        lambda n: np.full((n, n), np.nan),
+        lambda n: 2 * np.eye(n),
+        lambda n: np.eye(n) - 0.1 * np.eye(n, k=1),
+        lambda n: np.eye(n) + 0.5 * np.eye(n, k=1),
+    ],
+)
+def test_an_overlap_that_is_none_is_refused(few, spoil):
+    scene = replace(few, read_overlap=partial(spoil, 6))
+    with pytest.raises(DataError, match="its own overlap"):
+        build_table(scene, prepare_views(few))
+
+
+def test_depth_of_another_size_than_the_image_is_refused(few):
+    scene = replace(few, frames=[replace(few.frames[0], image_size=(60, 80))])
+    with pytest.raises(DataError, match=r"depth is \(120, 160\)"):
         prepare_views(scene)
 
 

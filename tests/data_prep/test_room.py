@@ -5,7 +5,7 @@ import torch
 from data_prep.converters.synthetic import RoomRequest, intrinsics, write_room
 from data_prep.raycast import render
 from data_prep.room import build_room, clearance, draw_cameras, draw_walk
-from data_prep.roundtrip import interpolate_depth
+from data_prep.surfaces import interpolate_depth
 from l3r.errors import DataError
 from l3r.geometry.camera import pixel_centers, project, unproject
 from l3r.geometry.rigid import invert_rigid, transform_points

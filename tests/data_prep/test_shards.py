@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import webdataset
 
-from data_prep.frames import FrameCache, reduce_frame, reduced_size
+from data_prep.frames import STORABLE, FrameCache, read_depth, reduce_frame
 from data_prep.ledger import FOLDER
 from data_prep.plan import hold_out, plan_graphs, scene_seed
 from data_prep.scene import Frame
 from data_prep.shards import build_shards, relative_to_first
+from data_prep.stored_size import reduced_size
 from l3r.data.schema import MANIFEST_NAME, decode_graph, load_index, read_manifest, read_members
 from l3r.errors import DataError
 from tests.data_prep.conftest import BUILD
@@ -135,17 +136,6 @@ def test_scenes_without_a_graph_are_refused(tmp_path, room_scene):
         build_shards([few], tmp_path, BUILD)
 
 
-def test_a_spoilt_frame_leaves_no_half_written_shard(tmp_path, room_scene):
-    def broken():
-        raise DataError("spoilt")
-
-    frames = [replace(frame, read_image=broken) for frame in room_scene.frames]
-    with pytest.raises(DataError, match="spoilt"):
-        build_shards([replace(room_scene, frames=frames)], tmp_path, BUILD)
-    assert not list(tmp_path.glob("*.tar"))
-    assert not (tmp_path / MANIFEST_NAME).exists()
-
-
 @pytest.mark.parametrize("bad", [{"num_graphs": 0}, {"graphs_per_shard": 0}])
 def test_requests_out_of_range_are_refused(bad):
     with pytest.raises(DataError, match="expected 1 or more"):
@@ -226,7 +216,57 @@ def test_held_out_frames_are_the_last_ones(room_scene):
 
 def test_a_scene_draws_the_same_graphs_whatever_stands_beside_it(room_scene):
     assert scene_seed("a", 0) != scene_seed("b", 0)
-    first = plan_graphs(room_scene, 3, 0, BUILD.sampling)
-    assert [plan.views for plan in first] == [
-        plan.views for plan in plan_graphs(room_scene, 5, 0, BUILD.sampling)[:3]
-    ]
+    first = plan_graphs(room_scene, 3, 0, BUILD.sampling).graphs
+    more = plan_graphs(room_scene, 5, 0, BUILD.sampling).graphs
+    assert [plan.views for plan in first] == [plan.views for plan in more[:3]]
+
+
+def test_scattered_depth_goes_to_the_pixel_it_falls_into_the_nearest_first():
+    depth = np.zeros((960, 1280), np.float32)
+    points = {(0, 0): 5.0, (1, 1): 3.0, (2, 3): 9.0, (959, 1279): 2.0, (501, 700): 7.0}
+    for at, z in points.items():
+        depth[at] = z
+    frame = Frame(
+        name="points",
+        image_size=(960, 1280),
+        K=np.array([[600.0, 0, 640], [0, 600, 480], [0, 0, 1]]),
+        world_from_cam=np.eye(4),
+        read_image=lambda: np.zeros((960, 1280, 3), np.uint8),
+        read_depth=lambda: depth,
+    )
+    stored = reduce_frame(frame, sparse=True).depth
+    expected = np.zeros((480, 640), np.float32)
+    expected[0, 0], expected[1, 1], expected[479, 639], expected[250, 350] = 3, 9, 2, 7
+    np.testing.assert_array_equal(stored, expected)
+
+
+def test_scattered_depth_keeps_its_place_at_any_ratio():
+    # 1066 x 1896 becomes 480 x 854: neither side divides.
+    draw = np.random.default_rng(0)
+    depth = np.zeros((1896, 1066), np.float32)
+    rows, columns = draw.integers(0, 1896, 500), draw.integers(0, 1066, 500)
+    depth[rows, columns] = np.arange(500) + 1
+    frame = Frame(
+        name="points",
+        image_size=depth.shape,
+        K=np.array([[900.0, 0, 533], [0, 900, 948], [0, 0, 1]]),
+        world_from_cam=np.eye(4),
+        read_image=lambda: np.zeros((*depth.shape, 3), np.uint8),
+        read_depth=lambda: depth,
+    )
+    stored = reduce_frame(frame, sparse=True)
+    row, column = np.nonzero(stored.depth)
+    number = stored.depth[row, column].astype(int) - 1
+    source_row, source_column = rows[number], columns[number]
+    ratio = np.array(stored.depth.shape) / np.array(depth.shape)
+    assert np.abs(row + 0.5 - (source_row + 0.5) * ratio[0]).max() <= 0.5
+    assert np.abs(column + 0.5 - (source_column + 0.5) * ratio[1]).max() <= 0.5
+    assert len(row) > 480
+
+
+def test_depth_that_shards_cannot_hold_is_unknown(room_scene):
+    least, most = STORABLE
+    values = [least, most, least / 2, most * 1.01, -1, np.inf, np.nan, 0]
+    depth = np.array([values], np.float32)
+    frame = replace(room_scene.frames[0], image_size=(1, 8), read_depth=lambda: depth)
+    np.testing.assert_array_equal(read_depth(frame), [[least, most, 0, 0, 0, 0, 0, 0]])

@@ -4,12 +4,29 @@ import numpy as np
 import pytest
 import torch
 
+from data_prep.converters import read_scenes, survey_scenes
 from data_prep.converters.synthetic import pose_lines
-from data_prep.converters.tartanair import HELD_OUT, read, read_npy_depth, read_png, read_poses
-from data_prep.roundtrip import interpolate_depth
+from data_prep.converters.tartanair import HELD_OUT, read, read_npy_depth
+from data_prep.converters.trajectories import read_poses
+from data_prep.problems import Problems
+from data_prep.surfaces import interpolate_depth
 from l3r.errors import DataError
 from l3r.geometry.camera import project, unproject
 from l3r.geometry.rigid import invert_rigid, transform_points
+from tests.data_prep.raw_writer import write_v1, write_v2
+
+RELEASES = {"tartanair": write_v1, "tartanair_v2": write_v2}
+GENUINE = {
+    "tartanair": ("tartanair_v1_seq", "hospital/Easy/P012", 30, (480, 640)),
+    "tartanair_v2": ("tartanair_v2", "AbandonedSchoolExposure/Data_easy/P000", 10, (640, 640)),
+}
+PAIRS = {"tartanair": ((0, 1), (5, 7), (20, 18)), "tartanair_v2": ((0, 1), (3, 5), (9, 7))}
+
+
+def read_all(root, dataset="tartanair", split="all", **options):
+    """Scenes and what was left out."""
+    problems = Problems()
+    return list(read_scenes(dataset, root, split, problems=problems, **options)), problems.counts
 
 
 @pytest.fixture
@@ -32,20 +49,40 @@ def agreement(frame, other):
     return float(((found - z).abs() < 0.01 * z)[inside].double().mean())
 
 
-def test_axes_and_intrinsics_of_a_genuine_trajectory_are_proven_by_reprojection(shared):
-    (scene,) = read(shared / "data" / "raw" / "tartanair_v1_seq")
-    assert (scene.name, len(scene.frames), scene.is_metric) == ("hospital/Easy/P012", 30, True)
-    for first, second in ((0, 1), (5, 7), (20, 18)):
+@pytest.mark.parametrize("dataset", list(GENUINE))
+def test_axes_and_intrinsics_of_genuine_trajectories_are_proven_by_reprojection(shared, dataset):
+    folder, name, number, size = GENUINE[dataset]
+    (scene,), left_out = read_all(shared / "data" / "raw" / folder, dataset, "train")
+    assert (scene.dataset, scene.name, len(scene.frames)) == (dataset, name, number)
+    assert scene.is_metric
+    assert not left_out
+    height, width = size
+    np.testing.assert_array_equal(
+        scene.frames[0].K, [[320, 0, width / 2], [0, 320, height / 2], [0, 0, 1]]
+    )
+    for first, second in PAIRS[dataset]:
         assert agreement(scene.frames[first], scene.frames[second]) > 0.75
 
 
+@pytest.mark.parametrize("dataset", list(RELEASES))
+def test_files_written_from_the_description_read_back_exactly(room_scene, tmp_path, dataset):
+    RELEASES[dataset](tmp_path / "env" / "level" / "P000", room_scene.frames[:3])
+    (scene,), left_out = read_all(tmp_path, dataset)
+    assert not left_out
+    for frame, expected in zip(scene.frames, room_scene.frames, strict=False):
+        np.testing.assert_array_equal(frame.read_image(), expected.read_image())
+        np.testing.assert_array_equal(frame.read_depth(), expected.read_depth())
+        np.testing.assert_allclose(frame.world_from_cam, expected.world_from_cam, atol=1e-9)
+        np.testing.assert_array_equal(frame.K, expected.K)
+
+
 def test_a_rendered_room_reads_back_with_its_axes(raw_room):
-    (walk,) = read(raw_room, scenes="*/P002")
+    ((walk,), _) = read_all(raw_room, scenes="*/P002")
     assert agreement(walk.frames[0], walk.frames[1]) > 0.8
 
 
 def test_scenes_are_read_frame_by_frame_with_the_image_centre_as_principal_point(raw_room):
-    scenes = list(read(raw_room))
+    scenes, _ = read_all(raw_room)
     assert [scene.name for scene in scenes] == [f"room000/Easy/P00{n}" for n in range(3)]
     assert scenes[1].slug == "room000-Easy-P001"
     frame = scenes[0].frames[3]
@@ -56,7 +93,7 @@ def test_scenes_are_read_frame_by_frame_with_the_image_centre_as_principal_point
 
 
 def test_every_other_frame_is_taken_on_request(raw_room):
-    (scene,) = read(raw_room, scenes="*/P001", frame_step=3)
+    (scene,), _ = read_all(raw_room, scenes="*/P001", frame_step=3)
     assert [frame.name for frame in scene.frames] == ["000000_left.png", "000003_left.png"]
 
 
@@ -79,10 +116,19 @@ def test_the_public_test_trajectories_are_held_out(raw_room, tmp_path):
     assert len(HELD_OUT) == 32
     for name in ("office2/Easy/P011", "office2/Easy/P010"):
         shutil.copytree(raw_room / "room000" / "Easy" / "P001", tmp_path / "office2" / name)
-    names = {s: [scene.name for scene in read(tmp_path, s)] for s in ("train", "test", "all")}
+    names = {s: [x.name for x in read_all(tmp_path, split=s)[0]] for s in ("train", "test", "all")}
     assert names["train"] == ["office2/Easy/P010"]
     assert names["test"] == ["office2/Easy/P011"]
     assert names["all"] == ["office2/Easy/P010", "office2/Easy/P011"]
+    excluded = {row.name: row.excluded for row in survey_scenes("tartanair", tmp_path)}
+    assert excluded == {"office2/Easy/P010": "", "office2/Easy/P011": "held out for testing"}
+
+
+def test_the_second_release_has_no_test_trajectories(room_scene, tmp_path):
+    write_v2(tmp_path / "office2" / "Easy" / "P011", room_scene.frames[:1])
+    assert len(read_all(tmp_path, "tartanair_v2", "train")[0]) == 1
+    with pytest.raises(DataError, match="is in split 'test'"):
+        read_all(tmp_path, "tartanair_v2", "test")
 
 
 def test_companions_a_mac_leaves_are_ignored(raw):
@@ -91,8 +137,21 @@ def test_companions_a_mac_leaves_are_ignored(raw):
     mac = raw.parent / "._P009"
     mac.mkdir()
     (mac / "pose_left.txt").write_text("")
-    (scene,) = read(raw.parents[2])
+    (scene,), left_out = read_all(raw.parents[2])
     assert len(scene.frames) == 4
+    assert not left_out
+
+
+def test_folders_that_link_to_each_other_are_searched_once(raw):
+    (raw.parent / "again").symlink_to(raw.parents[1], target_is_directory=True)
+    assert len(read_all(raw.parents[2])[0]) == 1
+
+
+def test_of_two_trajectories_of_one_name_the_first_is_kept(raw, tmp_path):
+    shutil.copytree(raw, tmp_path / "raw" / "z" / "room000" / "Easy" / "P001")
+    scenes, left_out = read_all(tmp_path / "raw")
+    assert len(scenes) == 1
+    assert left_out == {"duplicate_scene": 1}
 
 
 def test_sky_and_unknown_depth_become_zero(tmp_path):
@@ -103,56 +162,30 @@ def test_sky_and_unknown_depth_become_zero(tmp_path):
     )
 
 
-def test_a_folder_without_trajectories_is_refused(tmp_path):
-    with pytest.raises(DataError, match=r"no pose_left\.txt below it"):
-        list(read(tmp_path))
+@pytest.mark.parametrize("dataset", list(RELEASES))
+def test_a_folder_without_trajectories_is_refused(tmp_path, dataset):
+    for call in (read_all, lambda root, dataset: list(survey_scenes(dataset, root))):
+        with pytest.raises(DataError, match=r"no pose_\w+\.txt below it"):
+            call(tmp_path, dataset)
 
 
 def test_a_pattern_that_matches_nothing_is_refused(raw_room):
     with pytest.raises(DataError, match="none of 3 trajectories"):
-        list(read(raw_room, scenes="nowhere/*"))
+        read_all(raw_room, scenes="nowhere/*")
 
 
-def test_another_number_of_poses_than_images_is_refused(raw):
-    lines = (raw / "pose_left.txt").read_text().splitlines(keepends=True)
-    (raw / "pose_left.txt").write_text("".join(lines[:-1]))
-    with pytest.raises(DataError, match=r"4 images in image_left, 3 lines in pose_left\.txt"):
-        list(read(raw))
-
-
-@pytest.mark.parametrize(
-    "line",
-    ["1 2 3 0 0 0 0.5", "1 2 3 nan 0 0 1", "nan 2 3 0 0 0 1", "1 2 3 0 0 0", "1 2 3 0 0 0 one", ""],
-)
-def test_a_bad_pose_is_refused_with_file_and_line(raw, line):
-    lines = (raw / "pose_left.txt").read_text().splitlines()
-    lines[2] = line
-    (raw / "pose_left.txt").write_text("\n".join(lines) + "\n")
-    with pytest.raises(DataError, match=r"pose_left\.txt:3: "):
-        list(read(raw))
-
-
-def test_a_missing_depth_map_is_named(raw):
+def test_a_survey_counts_what_is_whole_and_what_lacks_something(raw_room, raw):
     (raw / "depth_left" / "000002_left_depth.npy").unlink()
-    with pytest.raises(DataError, match="000002_left_depth"):
-        list(read(raw))
+    lost = raw.parent / "P009" / "image_left"
+    lost.mkdir(parents=True)
+    row, orphan = survey_scenes("tartanair", raw.parents[2])
+    assert (row.name, row.num_images, row.num_missing) == ("room000/Easy/P001", 3, 1)
+    assert (row.image_size, row.excluded) == ((120, 160), "")
+    assert (orphan.name, orphan.num_images) == (str(lost.parent), 0)
+    assert "no pose_left.txt" in orphan.excluded
+    assert [row.num_images for row in survey_scenes("tartanair", raw_room)] == [24, 4, 6]
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5, 0.98])
-def test_files_cut_off_are_named(raw, share):
-    image = raw / "image_left" / "000001_left.png"
-    depth = raw / "depth_left" / "000001_left_depth.npy"
-    for path in (image, depth):
-        data = path.read_bytes()
-        path.write_bytes(data[: int(share * len(data))])
-    with pytest.raises(DataError, match="no whole PNG"):
-        read_png(image)
-    with pytest.raises(DataError, match="no whole array"):
-        read_npy_depth(depth, (120, 160))
-
-
-def test_depth_of_another_type_or_size_is_refused(tmp_path):
-    for depth in (np.ones((2, 3), np.float64), np.ones((3, 2), np.float32)):
-        np.save(tmp_path / "d.npy", depth)
-        with pytest.raises(DataError, match="expected float32"):
-            read_npy_depth(tmp_path / "d.npy", (2, 3))
+def test_reading_starts_before_all_is_read(raw_room):
+    scenes = read(raw_room, "all", problems=Problems())
+    assert next(scenes).name == "room000/Easy/P000"
