@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from data_prep.scene import Scene
 
 _RAW_DEFAULTS: dict[str, Any] = {"scenes": "*", "split": "train", "frame_step": 1, "held_out": 0.0}
+_RAW_SWITCH = "include_excluded"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -60,6 +61,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="SHARE",
         help="write OUT/train and OUT/val, the last SHARE of each scene's frames (0)",
     )
+    raw.add_argument(
+        "--include-excluded",
+        action="store_true",
+        default=None,
+        help="also MegaDepth's scenes that evaluation sets are made of",
+    )
     add_room_arguments(
         parser.add_argument_group(
             "synthetic", "with held-out views it writes OUT/train and OUT/val"
@@ -80,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _refuse_foreign(args: argparse.Namespace) -> None:
-    foreign = list(_RAW_DEFAULTS) if args.dataset == "synthetic" else list(ROOM_DEFAULTS)
+    foreign = [*_RAW_DEFAULTS, _RAW_SWITCH] if args.dataset == "synthetic" else list(ROOM_DEFAULTS)
     for key in foreign:
         if getattr(args, key) is not None:
             raise DataError(
@@ -100,6 +107,8 @@ def _raw_parts(args: argparse.Namespace) -> list[Part]:
         key: default if getattr(args, key) is None else getattr(args, key)
         for key, default in _RAW_DEFAULTS.items()
     }
+    if args.include_excluded:
+        source[_RAW_SWITCH] = True
     share = source["held_out"]
     if not 0 <= share < 1 or source["frame_step"] < 1:
         raise DataError(
@@ -115,6 +124,7 @@ def _raw_parts(args: argparse.Namespace) -> list[Part]:
             scenes=source["scenes"],
             frame_step=source["frame_step"],
             problems=problems,
+            include_excluded=bool(args.include_excluded),
         )
 
     if not share:

@@ -22,6 +22,7 @@ from types import ModuleType
 from data_prep.problems import Problems
 from data_prep.scene import Scene
 from data_prep.survey import SceneSurvey
+from l3r.errors import DataError
 
 CONVERTERS = {
     "tartanair": "data_prep.converters.tartanair",
@@ -32,6 +33,8 @@ CONVERTERS = {
     "folder": "data_prep.converters.folder",
 }
 """Module of each raw data set; ``synthetic`` renders one in TartanAir's layout."""
+WITH_EXCLUDED = {"megadepth"}
+"""Those that leave scenes out by default because other benchmarks are made of them."""
 
 
 def read_scenes(
@@ -42,6 +45,7 @@ def read_scenes(
     scenes: str = "*",
     frame_step: int = 1,
     problems: Problems,
+    include_excluded: bool = False,
 ) -> Iterator[Scene]:
     """Read a raw data set by name.
 
@@ -52,12 +56,16 @@ def read_scenes(
         scenes: Pattern on scene names.
         frame_step: Take every so many frames.
         problems: Told about what is left out.
+        include_excluded: Also take scenes that hold evaluation sets (MegaDepth alone).
 
     Raises:
-        DataError: Nothing can be read.
+        DataError: Nothing can be read, or nothing is excluded from this data set.
     """
+    if include_excluded and dataset not in WITH_EXCLUDED:
+        raise DataError(f"--include-excluded has no effect on {dataset}; leave it out")
+    options = {"include_excluded": True} if include_excluded else {}
     found: Iterator[Scene] = _load(dataset).read(
-        root, split, scenes=scenes, frame_step=frame_step, problems=problems
+        root, split, scenes=scenes, frame_step=frame_step, problems=problems, **options
     )
     return found
 

@@ -103,6 +103,10 @@ def test_cameras_of_several_scenes_are_refused(raw_room, tmp_path, capsys):
         ("build tartanair --raw {t}/no --out {t}/o", "no pose_left.txt below"),
         ("build tartanair --raw {t} --out {t}/o --views 3", "--views has no effect on tartanair"),
         ("build synthetic --raw {t} --out {t}/o --split all", "--split has no effect"),
+        (
+            "build tartanair --raw {t} --out {t}/o --include-excluded",
+            "--include-excluded has no effect on tartanair",
+        ),
         ("build synthetic --raw {t} --out {t}/o --size 48", "expected HEIGHTxWIDTH"),
         ("build tartanair --raw {t} --out {t}/o --held-out 1", "expected a share"),
         ("build tartanair --raw {t} --out {t}/o --max-views 1", "expected 2 <= min_views"),

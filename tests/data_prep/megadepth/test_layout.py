@@ -8,6 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from data_prep.converters import read_scenes
 from data_prep.converters.lens import build_lens
 from data_prep.converters.megadepth import read, survey
 from data_prep.converters.megadepth.depth import drop_outliers, read_depth
@@ -150,7 +151,10 @@ def test_evaluation_scenes_are_excluded_with_the_reason(merged, tmp_path):
     assert (names, problems.summary()) == (["0001/dense0"], "4 excluded_scene")
     assert [scene.name for scene in read(tmp_path, "test", problems=problems)] == ["0015/dense0"]
     whole = read(tmp_path, "all", problems=Problems(), include_excluded=True)
-    assert [scene.name[:4] for scene in whole] == ["0001", "0002", "0008", "0015", "5004", "5016"]
+    every = ["0001", "0002", "0008", "0015", "5004", "5016"]
+    assert [scene.name[:4] for scene in whole] == every
+    named = read_scenes("megadepth", tmp_path, "all", problems=Problems(), include_excluded=True)
+    assert [scene.name[:4] for scene in named] == every
     reasons = {row.name[:4]: row.excluded for row in survey(tmp_path)}
     assert reasons["0001"] == ""
     assert "Image Matching Challenge" in reasons["0008"]
