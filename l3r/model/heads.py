@@ -106,9 +106,9 @@ def _run_chunk(
     *,
     recompute: bool,
 ) -> Tensor:
-    if chunk[-1] - chunk[0] == len(chunk) - 1:  # a run of images: nothing is copied
-        chosen = [entry[chunk[0] : chunk[-1] + 1] for entry in hooked]
-    else:
+    if len(chunk) == len(hooked[0]):
+        chosen = list(hooked)
+    else:  # copies, not slices: compiled code would depend on where a slice begins
         index = torch.tensor(chunk).to(hooked[0].device, non_blocking=True)
         chosen = [entry[index] for entry in hooked]
     tokens = [at_least_float32(entry) for entry in chosen]
