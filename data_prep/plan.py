@@ -1,36 +1,18 @@
 """Which graphs a scene's shards will hold, decided before any image is encoded."""
 
-import hashlib
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-import numpy as np
-import torch
-from jaxtyping import Float32
-
-from data_prep.covisibility import OverlapTable, build_table, median_parallax, pairs_of
-from data_prep.depth_views import DepthViews, ThinView, stack_views, thin_view
+from data_prep.depth_views import ThinView, stack_views, thin_view
+from data_prep.draw import GraphPlan, draw_graphs
 from data_prep.frames import read_image
-from data_prep.graph_sampling import SamplingOptions, sample_graphs
+from data_prep.graph_sampling import SamplingOptions
 from data_prep.problems import Problem
 from data_prep.scene import Frame, Scene
-from l3r.data.schema import PairTable
 from l3r.errors import DataError
 
 _LOG = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, kw_only=True)
-class GraphPlan:
-    """One graph to be stored."""
-
-    key: str
-    """Its name in the shard."""
-    views: list[int]
-    """Frames of the planned scene, in greedy order."""
-    pairs: PairTable
-    """How they relate."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +73,7 @@ def plan_graphs(
     if len(kept) < options.min_views:
         _warn_few(scene, options)
         return ScenePlan(scene=scene, graphs=[], dropped=found)
-    graphs = _draw(scene, stack_views(scene, thin), num_graphs, seed, options)
+    graphs = draw_graphs(scene, stack_views(scene, thin), num_graphs, seed, options)
     return ScenePlan(scene=scene, graphs=graphs, dropped=found)
 
 
@@ -118,42 +100,6 @@ def _warn_few(scene: Scene, options: SamplingOptions) -> None:
     _LOG.warning("%s: %d frames, a graph has %d or more", scene.name, found, options.min_views)
 
 
-def _draw(
-    scene: Scene, views: DepthViews, num_graphs: int, seed: int, options: SamplingOptions
-) -> list[GraphPlan]:
-    table = build_table(scene, views)
-    graphs = sample_graphs(
-        table.iou.numpy(),
-        table.score.numpy(),
-        table.angle.numpy(),
-        num_graphs,
-        seed=scene_seed(scene.name, seed),
-        options=options,
-    )
-    if len(graphs) < num_graphs:
-        _LOG.warning(
-            "%s: %d graphs of %d views or more, %d asked; the scene has no more start pairs",
-            scene.name,
-            len(graphs),
-            options.min_views,
-            num_graphs,
-        )
-    parallax = _parallax_of(views, graphs)
-    return [
-        GraphPlan(
-            key=f"{scene.dataset}-{scene.slug}-{number:06d}",
-            views=graph,
-            pairs=_take_pairs(table, parallax, graph),
-        )
-        for number, graph in enumerate(graphs)
-    ]
-
-
-def scene_seed(name: str, seed: int) -> int:
-    """Derive a scene's own seed, which does not depend on the scenes beside it."""
-    return int.from_bytes(hashlib.sha256(f"{seed}:{name}".encode()).digest()[:4], "big")
-
-
 def hold_out(scene: Scene, share: float) -> tuple[Scene, Scene]:
     """Split a scene by time: the last frames are held out, so that no graph sees both parts.
 
@@ -166,28 +112,3 @@ def hold_out(scene: Scene, share: float) -> tuple[Scene, Scene]:
     """
     cut = len(scene.frames) - round(share * len(scene.frames))
     return scene.take(range(cut)), scene.take(range(cut, len(scene.frames)))
-
-
-def _parallax_of(views: DepthViews, graphs: list[list[int]]) -> Float32[np.ndarray, "n n"]:
-    """Median parallax of all pairs that share a graph; NaN elsewhere."""
-    parallax = np.full((views.num_views, views.num_views), np.nan, dtype=np.float32)
-    np.fill_diagonal(parallax, 0)
-    pairs = sorted({pair for graph in graphs for pair in pairs_of(graph)})
-    if pairs:
-        index = torch.tensor(pairs, device=views.center.device)
-        first, second = np.array(pairs).T
-        parallax[first, second] = median_parallax(views, index).cpu().numpy()
-        parallax[second, first] = parallax[first, second]
-    return parallax
-
-
-def _take_pairs(
-    table: OverlapTable, parallax: Float32[np.ndarray, "n n"], graph: list[int]
-) -> PairTable:
-    """Cut a graph's rows and columns out of the scene's tables."""
-    rows = np.ix_(graph, graph)
-    tables = {
-        f.name: parallax if f.name == "parallax" else getattr(table, f.name).numpy()
-        for f in fields(PairTable)
-    }
-    return PairTable(**{name: whole[rows].astype(np.float64) for name, whole in tables.items()})

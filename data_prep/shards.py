@@ -17,10 +17,11 @@ import torch
 import webdataset
 from jaxtyping import Float64
 
+from data_prep.draw import GraphPlan
 from data_prep.frames import FrameCache
 from data_prep.graph_sampling import SamplingOptions
 from data_prep.ledger import PROBLEMS, Ledger, SceneRecord, ShardRecord
-from data_prep.plan import GraphPlan, ScenePlan, plan_graphs
+from data_prep.plan import ScenePlan, plan_graphs
 from data_prep.problems import Problem, Problems
 from data_prep.scene import Scene
 from l3r.data.schema import (

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import webdataset
 
+from data_prep.draw import scene_seed
 from data_prep.frames import STORABLE, FrameCache, read_depth, reduce_frame
 from data_prep.ledger import FOLDER
-from data_prep.plan import hold_out, plan_graphs, scene_seed
+from data_prep.plan import hold_out, plan_graphs
 from data_prep.scene import Frame
 from data_prep.shards import build_shards, relative_to_first
 from data_prep.stored_size import reduced_size
