@@ -8,10 +8,9 @@ import torch
 
 from l3r.config import RunConfig, from_plain, load_config, override_config, to_plain
 from l3r.model.light3r import Light3R
-from l3r.model.pretrained import load_exactly
+from l3r.model.pretrained import build_network
 from l3r.model.weight_files import (
     MODEL_PREFIX,
-    network_weights,
     read_weight_file,
     require_own,
     write_checkpoint,
@@ -50,9 +49,7 @@ def load_model_and_config(
     checkpoint = read_checkpoint(Path(path), mapped=True)
     config = from_plain(checkpoint["l3r_config"], str(path))
     config = override_config(config, settings, ("inference", "graph"))
-    model = Light3R(config.model, config.graph)
-    load_exactly(model, network_weights(checkpoint), str(path))
-    return model.to(device).eval(), config
+    return build_network(Light3R, config, checkpoint, str(path)).to(device).eval(), config
 
 
 def build_untrained(

@@ -47,6 +47,8 @@ WITHOUT_EFFECT = {
 HEIGHT_OF_512 = 384
 """An ``img_size`` of 512 x 512 stands for landscapes of 512 x 384 at most."""
 MAX_LENGTH = 10_000
+MAX_BITS = 64
+"""Of a whole number; Python refuses to print those of thousands of digits."""
 
 
 def parse_constructor(text: object) -> tuple[str, dict[str, Any]]:
@@ -62,7 +64,8 @@ def parse_constructor(text: object) -> tuple[str, dict[str, Any]]:
         CheckpointError: It is no such text, or a value is no literal.
     """
     if not isinstance(text, str) or len(text) > MAX_LENGTH:
-        raise CheckpointError(f"args.model is {_shorten(text)}, expected a constructor call")
+        found = _shorten(text) if isinstance(text, str) else f"a {type(text).__name__}"
+        raise CheckpointError(f"args.model is {found}, expected a constructor call")
     try:
         call = ast.parse(re.sub(r"\binf\b", "1e999", text.strip()), mode="eval").body
         if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name) or call.args:
@@ -100,9 +103,10 @@ def describe_network(name: str, settings: Mapping[str, Any]) -> tuple[str, Model
         What it is in words, its sizes, and whether it has heads: if not, ``head`` is ``linear``.
 
     Raises:
-        CheckpointError: A setting is missing, unknown, or not that of the released networks.
+        CheckpointError: A setting is missing, unknown, no plain value, or not that of the released
+            networks.
     """
-    given = {key: _as_tuple(value) for key, value in settings.items()}
+    given = {key: _plain(key, value) for key, value in settings.items()}
     head_type = given.pop("head_type", None)
     found = KINDS.get((name, head_type if isinstance(head_type, str) else None))
     if found is None or (head_type is not None and not isinstance(head_type, str)):
@@ -183,8 +187,22 @@ def _positive(key: str, value: object) -> int:
     return value
 
 
-def _as_tuple(value: Any) -> Any:
-    return tuple(_as_tuple(item) for item in value) if isinstance(value, list | tuple) else value
+def _plain(key: object, value: Any) -> Any:
+    """Let through what can be compared and shown: single values, and flat lists as tuples."""
+    is_list = isinstance(value, list | tuple)
+    items = tuple(value) if is_list else (value,)
+    for item in items:
+        if isinstance(item, int) and item.bit_length() > MAX_BITS:
+            found = f"a number of {item.bit_length()} bits"
+        elif item is not None and not isinstance(item, int | float | str):
+            found = f"a {type(item).__name__}"
+        else:
+            continue
+        held = f"a {type(value).__name__} that holds {found}" if is_list else found
+        raise CheckpointError(
+            f"{printable(key)} is {held}, expected a number, a text or a list of them"
+        )
+    return items if is_list else value
 
 
 def _shorten(value: object) -> str:

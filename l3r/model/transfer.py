@@ -147,11 +147,7 @@ def fill_network(network: nn.Module, transfer: Transfer, source: WeightSource) -
         CheckpointError: A weight is not finite.
     """
     for key, value in transfer.weights.items():
-        if value.is_meta or not value.float().isfinite().all():
-            raise CheckpointError(
-                f"{source.where}: {source.spell(key)} holds values that are not finite in float32; "
-                "fetch or write the file again"
-            )
+        require_finite(value, source.spell(key) or key, source.where)
     network.load_state_dict(transfer.weights, strict=False)
 
 
@@ -187,6 +183,24 @@ def require_weights(content: object, where: str) -> dict[str, Tensor]:
             "numbers"
         )
     return dict(content)
+
+
+def require_finite(weight: Tensor, name: str, where: str) -> None:
+    """Check that a weight has values, and that float32 can hold them.
+
+    Args:
+        weight: Any floating-point tensor.
+        name: Of the weight, for the message.
+        where: The file, for the message.
+
+    Raises:
+        CheckpointError: It is on the meta device, or a value is not finite.
+    """
+    if weight.is_meta or not weight.float().isfinite().all():
+        raise CheckpointError(
+            f"{where}: {printable(name)} holds values that are not finite in float32; fetch or "
+            "write the file again"
+        )
 
 
 def count_parameters(weights: Iterable[Tensor]) -> int:

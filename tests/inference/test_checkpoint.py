@@ -4,6 +4,7 @@ import pytest
 import torch
 
 import l3r
+from l3r import Light3R
 from l3r.errors import CheckpointError, ConfigError
 from l3r.inference.checkpoint import (
     build_untrained,
@@ -91,3 +92,45 @@ def test_other_files_of_torch_are_told_apart(tmp_path, written):
     torch.save(checkpoint, path)
     with pytest.raises(ConfigError, match=r"other\.pt: Key 'wings'"):
         l3r.load_model(path)
+
+
+@pytest.mark.parametrize(
+    ("part", "key", "value"),
+    [
+        ("encoder", "width", 2_000_000),
+        ("encoder", "width", 4 * 10**18),
+        ("encoder", "width", 4 * 10**30),
+        ("encoder", "depth", 10**9),
+        ("decoder", "width", 1_200_000),
+        ("alignment", "num_blocks", 10**9),
+    ],
+)
+@pytest.mark.parametrize("load", [l3r.load_model, Light3R.from_pretrained])
+def test_a_checkpoint_that_asks_for_a_giant_is_refused_before_it_is_built(
+    written, tmp_path, load, part, key, value
+):
+    checkpoint = read_checkpoint(written[0])
+    checkpoint["l3r_config"]["model"][part][key] = value
+    path = tmp_path / "giant.ckpt"
+    torch.save(checkpoint, path)
+    with pytest.raises(CheckpointError, match=r"giant\.ckpt: .*do not fit the config") as error:
+        load(path)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("damage", ["nan", "meta", "nested"])
+@pytest.mark.parametrize("load", [l3r.load_model, Light3R.from_pretrained])
+def test_weights_without_finite_numbers_are_refused(written, tmp_path, load, damage):
+    checkpoint = read_checkpoint(written[0])
+    key = "model.encoder.norm.weight"
+    weight = checkpoint["state_dict"][key]
+    checkpoint["state_dict"][key] = {
+        "nan": torch.full_like(weight, torch.nan),
+        "meta": weight.to("meta"),
+        "nested": torch.nested.nested_tensor([weight, weight[:2]]),
+    }[damage]
+    path = tmp_path / "bad.ckpt"
+    torch.save(checkpoint, path)
+    with pytest.raises(CheckpointError, match=r"bad\.ckpt: .*norm\.weight") as error:
+        load(path)
+    assert "\n" not in str(error.value)

@@ -133,6 +133,7 @@ def test_text_that_is_no_plain_constructor_is_refused_and_never_run(text, tmp_pa
         ("pos_embed='RoPE100', ", "", "settings lack pos_embed"),
         ("enc_depth=1,", "enc_depth='1',", "enc_depth is '1', expected a positive whole number"),
         ("enc_depth=1,", "enc_depth=True,", "enc_depth is True, expected a positive"),
+        ("enc_depth=1,", f"enc_depth=0x1{'0' * 5000},", "enc_depth is a number of 20001 bits"),
         ("enc_num_heads=2", "enc_num_heads=3", r"encoder.num_heads is 3"),
         ("(224, 224)", "(224, 224, 3)", "img_size is .*expected two numbers"),
         ("(224, 224)", "(224, 200)", "image_size"),
@@ -300,3 +301,18 @@ def test_a_file_of_half_the_precision_is_a_source_too(tmp_path):
     path = write_pth(tmp_path / "half.pth", state)
     source = official_source(path, read_weight_file(path, mapped=True))
     assert {value.dtype for value in source.weights.values()} == {torch.float16}
+
+
+def endless():
+    inner = []
+    inner.append(inner)
+    return inner
+
+
+@pytest.mark.parametrize(
+    "value", [torch.tensor([1, 1]), endless(), {"a": 1}, [[[[[[1]]]]]]], ids=str
+)
+def test_settings_that_are_no_plain_values_are_refused(value):
+    with pytest.raises(CheckpointError, match=r"mlp_ratio is .*expected") as error:
+        describe_network("CroCoNet", {"mlp_ratio": value})
+    assert "\n" not in str(error.value)
