@@ -1,14 +1,19 @@
-"""What of a folder of shards is finished, so that an interrupted build goes on where it stopped."""
+"""What of a folder of shards is finished, so that an interrupted build goes on where it stopped.
 
-import hashlib
+Several tasks may keep records in one folder: each file has one content, whoever writes it, and
+appears whole or not at all.
+"""
+
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from data_prep.problems import Problem
-from data_prep.scene import Scene
-from l3r.data.schema import MANIFEST_NAME, ShardEntry, index_path, read_manifest
+from data_prep.plan import ScenePlan, fingerprint
+from data_prep.plan_file import read_plan, write_plan
+from data_prep.scene import Scene, slug_of
+from l3r.data.schema import MANIFEST_NAME, Manifest, ShardEntry, index_path, read_manifest
 from l3r.errors import DataError
 from l3r.files import write_atomic
 
@@ -23,19 +28,9 @@ class ShardRecord:
     """A finished shard."""
 
     entry: ShardEntry
-    """What the manifest says of it; without graphs it is not listed there."""
+    """What the manifest says of it; without graphs there is no file, and it is not listed."""
     skipped: dict[str, str] = field(default_factory=dict)
     """Graphs left out because a frame could no longer be read, by key, and why."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SceneRecord:
-    """A planned scene."""
-
-    num_graphs: int
-    """Graphs planned."""
-    dropped: dict[str, Problem]
-    """What is wrong with the frames left out, by name."""
 
 
 class Ledger:
@@ -54,11 +49,14 @@ class Ledger:
         self.folder = out / FOLDER
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / "request.json"
-        if any(other != path for other in self.folder.glob("*.json")):
+        if path.is_file():
             self._compare(_read(path), request)
-        elif (out / MANIFEST_NAME).is_file():
-            self._adopt(request)
-        elif any(out.glob("*.tar")) and not path.is_file():
+        elif (manifest := self.find_manifest()) is not None:
+            # The folder was copied without its hidden files.
+            self._compare(_asked(manifest), request)
+            for entry in manifest.shards:
+                self.finish_shard(ShardRecord(entry=entry))
+        elif any(out.glob("*.tar")):
             raise DataError(
                 f"{out}: holds tars and no record of a build, expected an empty folder; name"
                 " another --out"
@@ -73,60 +71,93 @@ class Ledger:
                     " give the same options to go on, or name another --out"
                 )
 
-    def _adopt(self, request: dict[str, Any]) -> None:
-        """Take the records of a folder that was copied without its hidden files."""
-        manifest = read_manifest(self.out)
-        asked = {key: value for key, value in manifest.request.items() if key != PROBLEMS}
-        self._compare(asked, request)
-        for entry in manifest.shards:
-            self.finish_shard(ShardRecord(entry=entry))
+    def keep_names(self, names: Sequence[str]) -> None:
+        """Record the scenes of the build.
+
+        Raises:
+            DataError: They are not those the build began with.
+        """
+        path = self.folder / "scenes.json"
+        old = _read(path)["names"] if path.is_file() else list(names)
+        if old != list(names):
+            changed = sorted(set(old) ^ set(names))[:1] or ["their order"]
+            raise DataError(
+                f"{self.out}: begun with {len(old)} scenes, now there are {len(names)}"
+                f" ({changed[0]} differs); restore the source, or name another --out"
+            )
+        _write(path, {"names": old})
+
+    def find_manifest(self) -> Manifest | None:
+        """Give the manifest of an earlier build, if there is one."""
+        return read_manifest(self.out) if (self.out / MANIFEST_NAME).is_file() else None
+
+    def find_finished(self) -> Manifest | None:
+        """Give the manifest if every tar that it lists, and its index, is there at its size."""
+        manifest = self.find_manifest()
+        return manifest if manifest and all(map(self._is_there, manifest.shards)) else None
 
     def find_shard(self, name: str) -> ShardRecord | None:
         """Give the record of a shard if the tar and its index are there as recorded."""
-        path, shard = self.folder / f"{name}.json", self.out / name
-        if not (path.is_file() and shard.is_file() and index_path(shard).is_file()):
+        path = self.folder / f"{name}.json"
+        if not path.is_file():
             return None
         plain = _read(path)
         skipped = plain.pop("skipped", {})
         record = ShardRecord(entry=ShardEntry(**plain), skipped=skipped)
-        return record if shard.stat().st_size == record.entry.bytes else None
+        return record if self._is_there(record.entry) else None
+
+    def _is_there(self, entry: ShardEntry) -> bool:
+        shard = self.out / entry.name
+        if entry.num_graphs == 0:
+            return True
+        whole = shard.is_file() and shard.stat().st_size == entry.bytes
+        return whole and index_path(shard).is_file()
 
     def finish_shard(self, record: ShardRecord) -> None:
         """Record a finished shard."""
         entry = record.entry
         _write(self.folder / f"{entry.name}.json", {**asdict(entry), "skipped": record.skipped})
 
-    def find_scene(self, scene: Scene) -> SceneRecord | None:
-        """Give what was planned for a scene, None where it was not planned.
+    def has_plan(self, scene: Scene) -> bool:
+        """Whether a scene was planned.
 
         Raises:
-            DataError: The scene's frames or cameras are not those it was planned with.
+            DataError: It was, with other frames or cameras.
         """
-        path = self.folder / f"{scene.slug}.scene.json"
+        path = self._plan_path(scene.name)
         if not path.is_file():
-            return None
-        record = _read(path)
-        if record["fingerprint"] != _fingerprint(scene):
+            return False
+        if read_plan(path).fingerprint != fingerprint(scene):
             raise DataError(
                 f"{self.out}: the frames or cameras of {scene.name} have changed since the build"
                 " began; restore the source, or name another --out"
             )
-        dropped = {name: Problem(**plain) for name, plain in record.get("dropped", {}).items()}
-        return SceneRecord(num_graphs=int(record["num_graphs"]), dropped=dropped)
+        return True
 
-    def plan_scene(self, scene: Scene, record: SceneRecord) -> None:
-        """Record what was planned for a scene, the frames left out among its frames."""
-        plain = {"fingerprint": _fingerprint(scene), **asdict(record)}
-        _write(self.folder / f"{scene.slug}.scene.json", plain)
+    def read_plan(self, scene: str) -> ScenePlan:
+        """Give what was planned for a scene; nothing where it was not.
+
+        Raises:
+            DataError: The record is damaged.
+        """
+        path = self._plan_path(scene)
+        return read_plan(path) if path.is_file() else ScenePlan()
+
+    def keep_plan(self, scene: str, plan: ScenePlan) -> None:
+        """Record what was planned for a scene."""
+        write_plan(self._plan_path(scene), plan)
+
+    def remove_remains(self) -> None:
+        """Remove what killed processes left among the records."""
+        for path in self.folder.glob(".*.tmp"):
+            path.unlink(missing_ok=True)
+
+    def _plan_path(self, scene: str) -> Path:
+        return self.folder / f"{slug_of(scene)}.plan.npz"
 
 
-def _fingerprint(scene: Scene) -> str:
-    """Digest of a scene's frame names, sizes and cameras."""
-    digest = hashlib.sha256()
-    for frame in scene.frames:
-        digest.update(f"{frame.name} {frame.image_size}".encode())
-        digest.update(frame.K.tobytes() + frame.world_from_cam.tobytes())
-    return digest.hexdigest()
+def _asked(manifest: Manifest) -> dict[str, Any]:
+    return {key: value for key, value in manifest.request.items() if key != PROBLEMS}
 
 
 def _read(path: Path) -> dict[str, Any]:

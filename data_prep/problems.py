@@ -1,7 +1,9 @@
 """What is wrong with a raw data set: counted under a name, the rest is kept."""
 
 import logging
-from collections import Counter
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -35,12 +37,33 @@ class Problems:
     """How often each kind was met."""
     first: dict[str, Problem] = field(default_factory=dict)
     """The first of each kind."""
+    by_scene: defaultdict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    """The same counts for each scene that a converter was reading; what is no scene's is absent."""
     quiet: bool = False
     """Count only: whoever lists the counts says where."""
+
+    def __post_init__(self) -> None:
+        """Begin with no scene."""
+        self._scene = ""
+
+    @contextmanager
+    def about(self, scene: str) -> Iterator[None]:
+        """Count what comes up inside the block as a scene's own.
+
+        Args:
+            scene: Its name.
+        """
+        self._scene = scene
+        try:
+            yield
+        finally:
+            self._scene = ""
 
     def add(self, kind: str, where: Path | str, detail: str) -> None:
         """Count a problem; the first few of each kind are logged with their file."""
         self.counts[kind] += 1
+        if self._scene:
+            self.by_scene[self._scene][kind] += 1
         self.first.setdefault(kind, Problem(kind=kind, where=str(where), detail=detail))
         if self.quiet:
             return

@@ -48,8 +48,8 @@ class Scene:
 
     @property
     def slug(self) -> str:
-        """Name fit for a key or a file: only letters, digits, ``-`` and ``_``."""
-        return "".join(c if c.isalnum() or c in "-_" else "-" for c in self.name)
+        """Name fit for a key or a file."""
+        return slug_of(self.name)
 
     @property
     def intrinsics(self) -> Float64[np.ndarray, "n 3 3"]:
@@ -84,3 +84,8 @@ def _cut_overlap(
             f" {num_frames} frames; the source's points do not belong to its images"
         )
     return whole[np.ix_(views, views)]
+
+
+def slug_of(name: str) -> str:
+    """Make a scene's name fit for a key or a file: only letters, digits, ``-`` and ``_``."""
+    return "".join(c if c.isalnum() or c in "-_" else "-" for c in name)

@@ -23,7 +23,7 @@ stage render l3r-prep render --raw "$OUT/raw" --views 3000 --held-out-views 300 
 
 # 2. Shards of 8-image graphs, through the TartanAir converter.
 stage shards l3r-prep build synthetic --raw "$OUT/raw" --out "$OUT/shards" \
-    --num-graphs 4000 --max-views 8 --size 40x40
+    --num-graphs 4000 --graphs-per-image 2 --max-views 8 --size 40x40
 stage check l3r-prep check "$OUT/shards/train"
 
 # 3. Training from scratch, a fixed number of steps.

@@ -4,12 +4,18 @@ import os
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
+from glob import escape
 from pathlib import Path
 
 
 def hidden_sibling(path: Path) -> Path:
     """Name an unused hidden path in the same folder, hence on the same file system."""
     return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+
+
+def hidden_siblings(path: Path) -> list[Path]:
+    """List what processes that were killed left of a file: names of :func:`hidden_sibling`."""
+    return sorted(path.parent.glob(f".{escape(path.name)}.*.tmp"))
 
 
 @contextmanager

@@ -5,25 +5,29 @@ manifest.json. Interrupted, the same command goes on where it stopped; finished 
 alone. What cannot be read is left out, logged with its file and counted at the end and in the
 manifest. 'l3r-prep inspect' says in seconds what a folder of raw data holds.
 
-example, of a raw data set and of rendered rooms:
+The work can be shared out: K tasks, on any machines that see both folders, each run the same
+command with --tasks K and their own --task-index. The last to finish writes manifest.json. Neither
+the number of tasks nor of workers changes a byte. slurm/build_shards.sh does this as a job array.
+
+example, of a raw data set, of half of its work, and of rendered rooms:
   l3r-prep build tartanair --raw TartanAir/ --out shards/tartanair --frame-step 4
+  l3r-prep build waymo --raw waymo/ --out shards/waymo --workers 8 --tasks 2 --task-index 0
   l3r-prep build synthetic --raw raw/room --out shards/room --num-graphs 4000 --max-views 8
 """
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable
-from functools import partial
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from data_prep.commands.room_options import ROOM_DEFAULTS, add_room_arguments, room_request
-from data_prep.converters import CONVERTERS, read_scenes
+from data_prep.converters import CONVERTERS
 from data_prep.problems import Problems
 from l3r.errors import DataError
 
 if TYPE_CHECKING:
-    from data_prep.scene import Scene
+    from data_prep.source import SceneSource
 
 _RAW_DEFAULTS: dict[str, Any] = {"scenes": "*", "split": "train", "frame_step": 1, "held_out": 0.0}
 _RAW_SWITCH = "include_excluded"
@@ -41,12 +45,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder of the raw data; for synthetic it is rendered there where absent",
     )
     add("--out", type=Path, required=True, metavar="DIR", help="folder to write to")
-    add("--num-graphs", type=int, default=1000, metavar="N", help="graphs of each scene (1000)")
-    add("--graphs-per-shard", type=int, default=100, metavar="N", help="graphs of each tar (100)")
+    add("--num-graphs", type=int, default=1000, metavar="N", help="most graphs a scene (1000)")
+    add(
+        "--graphs-per-image",
+        type=float,
+        default=1.0,
+        metavar="X",
+        help="most graphs of a scene for each of its images (1)",
+    )
+    add("--graphs-per-shard", type=int, default=128, metavar="N", help="graphs of each tar (128)")
     add("--max-views", type=int, default=10, metavar="N", help="most images of a graph (10)")
     add("--min-views", type=int, metavar="N", help="fewest images of a graph (8, or --max-views)")
     add("--seed", type=int, default=0, metavar="N", help="seed of the draw (0)")
-    add("--workers", type=int, default=0, metavar="N", help="processes that encode (0: this one)")
+    add("--workers", type=int, default=0, metavar="N", help="processes that work (0: this one)")
+    add("--tasks", type=int, default=1, metavar="K", help="tasks that share the work (1)")
+    add("--task-index", type=int, default=0, metavar="I", help="which of them this is, from 0")
     raw = parser.add_argument_group("raw data sets")
     raw.add_argument("--scenes", metavar="GLOB", help="pattern on names as inspect lists them (*)")
     raw.add_argument(
@@ -81,8 +94,8 @@ def run(args: argparse.Namespace) -> int:
     use_one_thread()
     _refuse_foreign(args)
     parts = _synthetic_parts(args) if args.dataset == "synthetic" else _raw_parts(args)
-    for folder, read, num_graphs, source in parts:
-        sys.stdout.write(_build(args, folder, read, num_graphs, source))
+    for folder, source, num_graphs, recorded in parts:
+        sys.stdout.write(_build(args, folder, source, num_graphs, recorded))
     return 0
 
 
@@ -95,108 +108,113 @@ def _refuse_foreign(args: argparse.Namespace) -> None:
             )
 
 
-Read = Callable[[Problems], Iterable["Scene"]]
-Part = tuple[Path, Read, int, dict[str, Any]]
-"""Folder of shards, what reads its scenes, graphs of each scene, options to record."""
+Part = tuple[Path, "SceneSource", int, dict[str, Any]]
+"""Folder of shards, what its scenes come from, graphs of each scene, options to record."""
 
 
 def _raw_parts(args: argparse.Namespace) -> list[Part]:
     from data_prep.plan import hold_out
+    from data_prep.source import PartSource, RawSource
 
-    source = {
+    recorded = {
         key: default if getattr(args, key) is None else getattr(args, key)
         for key, default in _RAW_DEFAULTS.items()
     }
     if args.include_excluded:
-        source[_RAW_SWITCH] = True
-    share = source["held_out"]
-    if not 0 <= share < 1 or source["frame_step"] < 1:
+        recorded[_RAW_SWITCH] = True
+    share = recorded["held_out"]
+    if not 0 <= share < 1 or recorded["frame_step"] < 1:
         raise DataError(
-            f"--held-out is {share} and --frame-step {source['frame_step']}, expected a share from"
-            " 0 to less than 1 and 1 or more"
+            f"--held-out is {share} and --frame-step {recorded['frame_step']}, expected a share"
+            " from 0 to less than 1 and 1 or more"
         )
-
-    def read(problems: Problems) -> Iterable["Scene"]:
-        return read_scenes(
-            args.dataset,
-            args.raw,
-            source["split"],
-            scenes=source["scenes"],
-            frame_step=source["frame_step"],
-            problems=problems,
-            include_excluded=bool(args.include_excluded),
-        )
-
+    source = RawSource(
+        converter=args.dataset,
+        root=args.raw,
+        split=recorded["split"],
+        scenes=recorded["scenes"],
+        frame_step=recorded["frame_step"],
+        include_excluded=bool(args.include_excluded),
+    )
     if not share:
-        return [(args.out, read, args.num_graphs, source)]
+        return [(args.out, source, args.num_graphs, recorded)]
     num_held = max(1, round(share * args.num_graphs))
-
-    def kept(problems: Problems) -> Iterable["Scene"]:
-        return (hold_out(scene, share)[0] for scene in read(problems))
-
-    def held(problems: Problems) -> Iterable["Scene"]:
-        return (hold_out(scene, share)[1] for scene in read(problems))
-
+    kept = PartSource(source, lambda scene: hold_out(scene, share)[0])
+    held = PartSource(source, lambda scene: hold_out(scene, share)[1])
     return [
-        (args.out / "train", kept, args.num_graphs, source),
-        (args.out / "val", held, num_held, source),
+        (args.out / "train", kept, args.num_graphs, recorded),
+        (args.out / "val", held, num_held, recorded),
     ]
 
 
 def _synthetic_parts(args: argparse.Namespace) -> list[Part]:
     from data_prep.commands.progress import show_progress
-    from data_prep.converters import synthetic, tartanair
+    from data_prep.converters import synthetic
+    from data_prep.source import RawSource
 
     request = room_request(args)
+    if args.tasks > 1 and not synthetic.is_complete(args.raw, request):
+        raise DataError(
+            f"{args.raw}: no finished room of this request, and several tasks would render it at"
+            " once; run 'l3r-prep render' with the same options first"
+        )
     with show_progress() as report:
         synthetic.write_room(args.raw, request, report=report)
 
-    def read(trajectory: str, problems: Problems) -> Iterable["Scene"]:
-        pattern = f"{request.environment}/Easy/{trajectory}"
-        return tartanair.read(
-            args.raw, "all", scenes=pattern, problems=problems, dataset="synthetic"
+    def trajectory(name: str) -> RawSource:
+        pattern = f"{request.environment}/Easy/{name}"
+        return RawSource(
+            converter="tartanair", root=args.raw, split="all", scenes=pattern, label="synthetic"
         )
 
-    source = {"scene_seed": request.scene_seed, "size": list(request.image_size)}
+    recorded = {"scene_seed": request.scene_seed, "size": list(request.image_size)}
     if not request.num_held_out:
-        return [(args.out, partial(read, "P000"), args.num_graphs, source)]
+        return [(args.out, trajectory("P000"), args.num_graphs, recorded)]
     num_held = max(1, round(args.num_graphs * request.num_held_out / request.num_views))
     return [
-        (args.out / "train", partial(read, "P000"), args.num_graphs, source),
-        (args.out / "val", partial(read, "P001"), num_held, source),
+        (args.out / "train", trajectory("P000"), args.num_graphs, recorded),
+        (args.out / "val", trajectory("P001"), num_held, recorded),
     ]
 
 
 def _build(
     args: argparse.Namespace,
     folder: Path,
-    read: Read,
+    source: "SceneSource",
     num_graphs: int,
-    source: dict[str, Any],
+    recorded: dict[str, Any],
 ) -> str:
+    from data_prep.build import build_shards
     from data_prep.commands.progress import show_progress
     from data_prep.graph_sampling import SamplingOptions
-    from data_prep.shards import BuildRequest, build_shards
+    from data_prep.ledger import PROBLEMS
+    from data_prep.units import BuildRequest, TaskShare
 
     min_views = min(8, args.max_views) if args.min_views is None else args.min_views
     request = BuildRequest(
         num_graphs=num_graphs,
+        graphs_per_image=args.graphs_per_image,
         graphs_per_shard=args.graphs_per_shard,
         seed=args.seed,
         sampling=SamplingOptions(min_views=min_views, max_views=args.max_views),
-        source=source,
+        source=recorded,
     )
-    problems = Problems()
     with show_progress() as report:
         manifest = build_shards(
-            read(problems),
+            source,
             folder,
             request,
+            share=TaskShare(index=args.task_index, count=args.tasks),
             num_workers=args.workers,
             report=report,
-            problems=problems,
         )
+    if manifest is None:
+        return (
+            f"{folder}: task {args.task_index} of {args.tasks} has written its shards; others have"
+            " not, and the last of them writes manifest.json\n"
+        )
+    left_out = Problems(counts=Counter(manifest.request.get(PROBLEMS, {}))).summary()
     return (
         f"{folder}: {manifest.num_graphs} graphs in {len(manifest.shards)} shards,"
-        f" {manifest.num_bytes / 1e6:.1f} MB; left out: {problems.summary()}\n"
+        f" {manifest.num_bytes / 1e6:.1f} MB; left out: {left_out}\n"
     )

@@ -9,6 +9,7 @@ example: l3r-prep inspect tartanair --raw TartanAir/ --num-graphs 1000
 
 import argparse
 import json
+import math
 import sys
 from collections import Counter
 from dataclasses import asdict, dataclass
@@ -37,7 +38,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("dataset", choices=sorted(CONVERTERS), help="layout of the source")
     add("--raw", type=Path, required=True, metavar="DIR", help="folder of the raw data")
-    add("--num-graphs", type=int, default=1000, metavar="N", help="graphs of each scene (1000)")
+    add("--num-graphs", type=int, default=1000, metavar="N", help="most graphs a scene (1000)")
+    add(
+        "--graphs-per-image",
+        type=float,
+        default=1.0,
+        metavar="X",
+        help="most graphs of a scene for each of its images (1)",
+    )
     add("--max-views", type=int, default=10, metavar="N", help="most images of a graph (10)")
     add("--min-views", type=int, metavar="N", help="fewest images of a graph (8, or --max-views)")
     add("--rows", type=int, default=40, metavar="N", help="scenes to list (40; 0: all)")
@@ -53,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
             " expected 1 or more, and 0 or more rows"
         )
     rows = [
-        _Row.of(scene, args.num_graphs, args.max_views, min_views)
+        _Row.of(scene, args.num_graphs, args.graphs_per_image, args.max_views, min_views)
         for scene in survey_scenes(args.dataset, args.raw)
     ]
     if args.json:
@@ -74,15 +82,23 @@ class _Row:
     """Most that its shards take."""
 
     @classmethod
-    def of(cls, scene: SceneSurvey, num_graphs: int, max_views: int, min_views: int) -> "_Row":
+    def of(
+        cls,
+        scene: SceneSurvey,
+        num_graphs: int,
+        graphs_per_image: float,
+        max_views: int,
+        min_views: int,
+    ) -> "_Row":
         left_out = scene.excluded
         if not left_out and scene.num_images < min_views:
             left_out = f"fewer than {min_views} images"
         size = 0
         if not left_out and scene.image_size is not None:
             height, width = reduced_size(scene.image_size)
+            quota = min(num_graphs, math.ceil(graphs_per_image * scene.num_images))
             # Each pair of images starts one graph at most.
-            graphs = min(num_graphs, scene.num_images * (scene.num_images - 1) // 2)
+            graphs = min(quota, scene.num_images * (scene.num_images - 1) // 2)
             views = min(max_views, scene.num_images)
             size = round(graphs * views * height * width * (DEPTH_BYTES + JPEG_BYTES))
         return cls(scene=scene, left_out=left_out, max_bytes=size)
@@ -105,6 +121,7 @@ def _to_plain(args: argparse.Namespace, rows: list[_Row]) -> dict[str, Any]:
         "raw": str(args.raw),
         "assumed": {
             "num_graphs": args.num_graphs,
+            "graphs_per_image": args.graphs_per_image,
             "max_views": args.max_views,
             "jpeg_bytes_per_pixel": JPEG_BYTES,
             "depth_bytes_per_pixel": DEPTH_BYTES,
@@ -133,9 +150,10 @@ def _print(args: argparse.Namespace, rows: list[_Row]) -> None:
     for reason, number in Counter(row.left_out for row in rows if row.left_out).most_common(10):
         console.print(f"  left out: {number} scenes, {reason}", markup=False)
     console.print(
-        f"shards: {_size(total['max_bytes'])} at most, with {args.num_graphs} graphs of"
-        f" {args.max_views} images a scene (or as many as it has pairs), every image stored anew"
-        f" in each of its graphs, {DEPTH_BYTES} bytes of depth and {JPEG_BYTES} of JPEG a pixel"
+        f"shards: {_size(total['max_bytes'])} at most, with {args.graphs_per_image:g} graphs of"
+        f" {args.max_views} images for each image of a scene, no more than {args.num_graphs} a"
+        f" scene, every image stored anew in each of its graphs, {DEPTH_BYTES} bytes of depth and"
+        f" {JPEG_BYTES} of JPEG a pixel"
     )
 
 

@@ -1,13 +1,16 @@
 """Raw data sets and the modules that read them.
 
-To add one: write a module or package ``data_prep/converters/NAME`` with these two functions, and
+To add one: write a module or package ``data_prep/converters/NAME`` with these three functions, and
 name it below; ``build``, ``cameras`` and ``inspect`` then offer it::
 
-    read(root, split, *, scenes, frame_step, problems) -> Iterator[Scene]
+    list_names(root, split, *, scenes, problems) -> list[str]
+    read(root, split, *, scenes, frame_step, problems, names) -> Iterator[Scene]
     survey(root) -> Iterator[SceneSurvey]
 
-``read`` streams: a scene holds cameras and names, its pixels follow frame by frame when asked for.
-What cannot be used is counted in ``problems`` and left out; DataError is for a root of which
+``list_names`` gives the names of what ``read`` would give, in one fixed order and without opening
+what is large, so that a build can be shared out. ``read`` streams: a scene holds cameras and names,
+its pixels follow frame by frame when asked for. What cannot be used is counted in ``problems``, a
+scene's own inside ``with problems.about(name)``, and left out; DataError is for a root of which
 nothing can be read. Every convention of the source is translated there, once: K in pixels with the
 centre of the top-left pixel at (0.5, 0.5), OpenCV camera axes, ``world_from_cam`` rigid, depth z,
 0 where unknown. ``survey`` lists what is there in seconds, without pixels. Give the data set limits
@@ -15,9 +18,10 @@ in ``data_prep/check.py`` once they were measured.
 """
 
 import importlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from data_prep.problems import Problems
 from data_prep.scene import Scene
@@ -45,6 +49,7 @@ def read_scenes(
     scenes: str = "*",
     frame_step: int = 1,
     problems: Problems,
+    names: Collection[str] | None = None,
     include_excluded: bool = False,
 ) -> Iterator[Scene]:
     """Read a raw data set by name.
@@ -56,18 +61,62 @@ def read_scenes(
         scenes: Pattern on scene names.
         frame_step: Take every so many frames.
         problems: Told about what is left out.
+        names: Only scenes of these names; where given, that none of them can be read is no error.
         include_excluded: Also take scenes that hold evaluation sets (MegaDepth alone).
 
     Raises:
         DataError: Nothing can be read, or nothing is excluded from this data set.
     """
-    if include_excluded and dataset not in WITH_EXCLUDED:
-        raise DataError(f"--include-excluded has no effect on {dataset}; leave it out")
-    options = {"include_excluded": True} if include_excluded else {}
     found: Iterator[Scene] = _load(dataset).read(
-        root, split, scenes=scenes, frame_step=frame_step, problems=problems, **options
+        root,
+        split,
+        scenes=scenes,
+        frame_step=frame_step,
+        problems=problems,
+        names=names,
+        **_options(dataset, include_excluded=include_excluded),
     )
     return found
+
+
+def list_scenes(
+    dataset: str,
+    root: Path,
+    split: str,
+    *,
+    scenes: str = "*",
+    problems: Problems,
+    include_excluded: bool = False,
+) -> list[str]:
+    """List the names of what :func:`read_scenes` reads, always in one order.
+
+    Some of them may turn out to have no usable frame.
+
+    Args:
+        dataset: A key of :data:`CONVERTERS`.
+        root: Folder of the raw data.
+        split: ``train``, ``test`` or ``all``.
+        scenes: Pattern on scene names.
+        problems: Told about what is left out before any scene is opened.
+        include_excluded: Also scenes that hold evaluation sets (MegaDepth alone).
+
+    Raises:
+        DataError: Nothing can be read, or nothing is excluded from this data set.
+    """
+    found: list[str] = _load(dataset).list_names(
+        root,
+        split,
+        scenes=scenes,
+        problems=problems,
+        **_options(dataset, include_excluded=include_excluded),
+    )
+    return found
+
+
+def _options(dataset: str, *, include_excluded: bool) -> dict[str, Any]:
+    if include_excluded and dataset not in WITH_EXCLUDED:
+        raise DataError(f"--include-excluded has no effect on {dataset}; leave it out")
+    return {"include_excluded": True} if include_excluded else {}
 
 
 def survey_scenes(dataset: str, root: Path) -> Iterator[SceneSurvey]:

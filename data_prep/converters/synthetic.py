@@ -61,6 +61,11 @@ class RoomRequest:
         """Name of the folder the room goes to."""
         return f"room{self.scene_seed:03d}"
 
+    @property
+    def lengths(self) -> dict[str, int]:
+        """Cameras of each trajectory."""
+        return {"P000": self.num_views, "P001": self.num_held_out, "P002": self.num_walk}
+
 
 def intrinsics(image_size: tuple[int, int]) -> Float64[np.ndarray, "3 3"]:
     """K of the layout, which carries none: 90 degrees across, principal point at the centre."""
@@ -84,18 +89,27 @@ def write_room(root: Path, request: RoomRequest, *, report: Report = _silent) ->
     """
     room = build_room(request.scene_seed)
     folder = root / request.environment
-    trajectories = {
-        "P000": (request.num_views, draw_cameras),
-        "P001": (request.num_held_out, draw_cameras),
-        "P002": (request.num_walk, draw_walk),
-    }
-    for number, (name, (num_views, draw)) in enumerate(trajectories.items()):
+    for number, (name, num_views) in enumerate(request.lengths.items()):
+        draw = draw_walk if name == "P002" else draw_cameras
         target = folder / "Easy" / name
         if num_views and not _is_complete(target, request, num_views):
             world_from_cam = draw(room, num_views, 1000 * request.scene_seed + number)
             told = partial(report, f"{request.environment}/Easy/{name}")
             write_tartanair(target, room, world_from_cam, request.image_size, report=told)
     return folder
+
+
+def is_complete(root: Path, request: RoomRequest) -> bool:
+    """Tell whether a room is rendered.
+
+    Raises:
+        DataError: The folder holds a trajectory of another length.
+    """
+    return all(
+        _is_complete(root / request.environment / "Easy" / name, request, num_views)
+        for name, num_views in request.lengths.items()
+        if num_views
+    )
 
 
 def _is_complete(target: Path, request: RoomRequest, num_views: int) -> bool:

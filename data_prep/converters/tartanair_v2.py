@@ -5,7 +5,7 @@ Poses, axes and intrinsics: :mod:`data_prep.converters.trajectories`. A depth ma
 Only the left front camera is read.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,7 @@ def read(
     scenes: str = "*",
     frame_step: int = 1,
     problems: Problems,
+    names: Collection[str] | None = None,
 ) -> Iterator[Scene]:
     """Find trajectories and read their cameras; pixels follow when asked for.
 
@@ -35,6 +36,7 @@ def read(
         scenes: Pattern on ``ENV/Data_LEVEL/PNNN``.
         frame_step: Take every so many frames.
         problems: Told about what is left out.
+        names: Only scenes of these names; where given, that none of them can be read is no error.
 
     Yields:
         One scene per trajectory, sorted by name.
@@ -43,7 +45,16 @@ def read(
         DataError: There is no trajectory, none is asked for, or none of those can be read.
     """
     chosen = trajectories.choose_trajectories(root, LAYOUT, problems, split=split, scenes=scenes)
-    yield from trajectories.read_scenes(chosen, LAYOUT, problems, "tartanair_v2", frame_step)
+    yield from trajectories.read_scenes(
+        chosen, LAYOUT, problems, dataset="tartanair_v2", frame_step=frame_step, names=names
+    )
+
+
+def list_names(root: Path, split: Split, *, scenes: str, problems: Problems) -> list[str]:
+    """List the names of what :func:`read` reads, in its order; arguments and errors are its own."""
+    return list(
+        trajectories.choose_trajectories(root, LAYOUT, problems, split=split, scenes=scenes)
+    )
 
 
 def survey(root: Path) -> Iterator[SceneSurvey]:

@@ -7,7 +7,7 @@ point the image centre, as published for 640x480 and 640x640.
 """
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from functools import partial
@@ -90,7 +90,13 @@ def choose_trajectories(
 
 
 def read_scenes(
-    chosen: dict[str, Path], layout: Layout, problems: Problems, dataset: str, frame_step: int
+    chosen: dict[str, Path],
+    layout: Layout,
+    problems: Problems,
+    *,
+    dataset: str,
+    frame_step: int,
+    names: Collection[str] | None,
 ) -> Iterator[Scene]:
     """Read trajectories one by one.
 
@@ -100,18 +106,22 @@ def read_scenes(
         problems: Told about frames and trajectories that are left out.
         dataset: Name the scenes carry.
         frame_step: Take every so many frames.
+        names: Only these of them, and no error if none has a frame.
 
     Raises:
         DataError: None of them has a frame.
     """
-    some = False
+    some = names is not None
     for name, folder in chosen.items():
-        frames = list(read_trajectory(folder, layout, problems, frame_step))
+        if names is not None and name not in names:
+            continue
+        with problems.about(name):
+            frames = list(read_trajectory(folder, layout, problems, frame_step))
+            if not frames:
+                problems.add("empty_scene", folder, "no frame is left")
         some = some or bool(frames)
         if frames:
             yield Scene(dataset=dataset, name=name, is_metric=True, frames=frames)
-        else:
-            problems.add("empty_scene", folder, "no frame is left")
     if not some:
         raise DataError(
             f"{next(iter(chosen.values()))}: no frame has image, depth and camera"

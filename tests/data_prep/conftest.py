@@ -1,12 +1,15 @@
 """One small rendered room for all tests of data preparation."""
 
+import shutil
+
 import pytest
 
+from data_prep.build import build_shards
 from data_prep.converters.synthetic import RoomRequest, write_room
-from data_prep.converters.tartanair import read
 from data_prep.graph_sampling import SamplingOptions
 from data_prep.problems import Problems
-from data_prep.shards import BuildRequest, build_shards
+from data_prep.source import HeldSource, RawSource
+from data_prep.units import BuildRequest
 from tests.data_prep.scattered import scatter
 
 REQUEST = RoomRequest(num_views=24, num_held_out=4, num_walk=6, image_size=(120, 160))
@@ -27,7 +30,10 @@ def raw_room(tmp_path_factory):
 def room_scene(raw_room):
     """The room's training trajectory."""
     problems = Problems()
-    (scene,) = read(raw_room, scenes="*/P000", dataset="synthetic", problems=problems)
+    source = RawSource(
+        converter="tartanair", root=raw_room, split="all", scenes="*/P000", label="synthetic"
+    )
+    (scene,) = source.read(source.list_names(problems), problems)
     assert not problems.counts
     return scene
 
@@ -36,7 +42,7 @@ def room_scene(raw_room):
 def room_shards(tmp_path_factory, room_scene):
     """Its shards; not to be written to."""
     out = tmp_path_factory.mktemp("shards")
-    build_shards([room_scene], out, BUILD)
+    build_shards(HeldSource([room_scene]), out, BUILD)
     return out
 
 
@@ -50,5 +56,13 @@ def scattered_scene(room_scene):
 def scattered_shards(tmp_path_factory, scattered_scene):
     """Its shards; not to be written to."""
     out = tmp_path_factory.mktemp("scattered")
-    build_shards([scattered_scene], out, BUILD)
+    build_shards(HeldSource([scattered_scene]), out, BUILD)
     return out
+
+
+@pytest.fixture
+def raw(raw_room, tmp_path):
+    """A copy of the small held-out trajectory that a test may spoil."""
+    target = tmp_path / "raw" / "room000" / "Easy" / "P001"
+    shutil.copytree(raw_room / "room000" / "Easy" / "P001", target)
+    return target

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 
+from data_prep.build import build_shards
+from data_prep.graph_sampling import SamplingOptions
 from data_prep.ledger import FOLDER
-from data_prep.problems import Problems
-from data_prep.scene import Scene
-from data_prep.shards import build_shards
+from data_prep.source import HeldSource, RawSource
 from l3r.data.schema import (
     MANIFEST_NAME,
     decode_graph,
@@ -48,9 +48,10 @@ def breaks_after(frame, reads):
 
 
 def build(scene, out, **options):
-    problems = Problems()
-    manifest = build_shards([scene], out, BUILD, problems=problems, **options)
-    return manifest, problems.counts
+    """Manifest, and how often each problem came up."""
+    scenes = scene if isinstance(scene, list) else [scene]
+    manifest = build_shards(HeldSource(scenes), out, BUILD, **options)
+    return manifest, manifest.request.get("problems", {})
 
 
 def files_in(folder):
@@ -72,7 +73,6 @@ def test_frames_that_cannot_be_read_are_in_no_graph_and_are_named(
 ):
     manifest, counts = build(spoil(room_scene, BROKEN, what), tmp_path)
     assert counts == {"unreadable_frame": 2}
-    assert manifest.request["problems"] == counts
     names = {room_scene.frames[view].name for view in BROKEN}
     assert not any(names & set(files) for _, files in files_in(tmp_path))
     assert manifest.num_graphs == BUILD.num_graphs
@@ -94,29 +94,34 @@ def test_frames_of_which_no_depth_is_known_are_left_out(room_scene, tmp_path):
 
 
 def test_an_interrupted_build_leaves_the_same_frames_out_again(room_scene, tmp_path):
-    def stop(scene, done, total):
-        raise KeyboardInterrupt
+    def stop(name, done, total):
+        if name == "graphs written" and done:
+            raise KeyboardInterrupt
 
     scene = spoil(room_scene, BROKEN)
     build(scene, tmp_path / "straight")
     with pytest.raises(KeyboardInterrupt):
         build(scene, tmp_path / "resumed", report=stop)
     # Repaired meanwhile: what was planned without them stays without them.
-    manifest, counts = build(room_scene, tmp_path / "resumed")
+    _, counts = build(room_scene, tmp_path / "resumed")
     assert digests(tmp_path / "resumed") == digests(tmp_path / "straight")
-    assert counts == manifest.request["problems"] == {"unreadable_frame": 2}
+    assert counts == {"unreadable_frame": 2}
     # And a third time, when nothing is left to do.
     assert build(room_scene, tmp_path / "resumed")[1] == counts
 
 
-def test_depth_that_broke_since_the_build_began_is_refused(room_scene, tmp_path):
-    def stop(scene, done, total):
-        raise KeyboardInterrupt
+def test_an_interrupted_build_does_not_relate_the_images_again(room_scene, room_shards, tmp_path):
+    def stop(name, done, total):
+        if name == "graphs written" and done:
+            raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         build(room_scene, tmp_path, report=stop)
-    with pytest.raises(DataError, match=r"000003_left\.png: has changed since the build began"):
-        build(spoil(room_scene, [3], "read_depth"), tmp_path)
+    rest = {file for _, files in files_in(room_shards)[2:] for file in files}
+    others = [n for n, frame in enumerate(room_scene.frames) if frame.name not in rest]
+    assert others
+    build(spoil(room_scene, others, "read_depth"), tmp_path)
+    assert digests(tmp_path) == digests(room_shards)
 
 
 def test_an_image_that_breaks_later_takes_its_graphs_and_no_others(
@@ -152,7 +157,7 @@ def test_a_shard_that_loses_all_its_graphs_is_not_listed(room_scene, room_shards
     listed = [shard.name for shard in manifest.shards]
     assert 0 < len(listed) < len(read_manifest(room_shards).shards)
     assert last not in listed
-    assert (tmp_path / "some" / last).is_file()
+    assert not (tmp_path / "some" / last).exists()
     assert build(room_scene, tmp_path / "some")[0] == manifest
 
 
@@ -167,38 +172,33 @@ def test_a_folder_copied_without_its_records_is_taken_up_with_its_counts(room_sc
 
 def test_a_scene_without_readable_frames_does_not_end_the_build(room_scene, room_shards, tmp_path):
     dead = replace(spoil(room_scene, range(24)), name="dead")
-    problems = Problems()
-    build_shards([dead, room_scene], tmp_path, BUILD, problems=problems)
-    assert problems.counts == {"unreadable_frame": 24}
-    assert digests(tmp_path) == digests(room_shards)
+    _, counts = build([dead, room_scene], tmp_path)
+    assert counts == {"unreadable_frame": 24}
+    assert [*digests(tmp_path).values()] == [*digests(room_shards).values()]
 
 
 def test_a_scene_whose_own_overlap_is_damaged_does_not_end_the_build(
     room_scene, room_shards, tmp_path
 ):
     dead = replace(room_scene, name="dead", read_overlap=broken)
-    problems = Problems()
-    build_shards([dead, room_scene], tmp_path, BUILD, problems=problems)
-    assert problems.counts == {"unusable_scene": 1}
-    assert digests(tmp_path) == digests(room_shards)
+    _, counts = build([dead, room_scene], tmp_path)
+    assert counts == {"unusable_scene": 1}
+    assert [*digests(tmp_path).values()] == [*digests(room_shards).values()]
 
 
 def test_scenes_whose_names_become_one_are_not_mixed(room_scene, room_shards, tmp_path):
     other = replace(room_scene, name=room_scene.name.replace("/", " "))
     assert other.slug == room_scene.slug
-    problems = Problems()
-    build_shards([room_scene, other], tmp_path, BUILD, problems=problems)
-    assert problems.counts == {"name_clash": 1}
+    _, counts = build([room_scene, other], tmp_path)
+    assert counts == {"name_clash": 1}
     assert digests(tmp_path) == digests(room_shards)
 
 
-def test_the_problems_of_the_converter_are_counted_in_the_manifest(room_scene, tmp_path):
-    problems = Problems()
-
-    def scenes() -> Scene:
-        problems.add("missing_depth", "x.npy", "no such file")
-        yield room_scene
-
-    build_shards(scenes(), tmp_path, BUILD, problems=problems)
-    plain = json.loads((tmp_path / MANIFEST_NAME).read_bytes())
+def test_the_problems_of_the_converter_are_counted_in_the_manifest(raw, tmp_path):
+    (raw / "depth_left" / "000003_left_depth.npy").unlink()
+    source = RawSource(converter="tartanair", root=raw, split="all", label="synthetic")
+    request = replace(BUILD, sampling=SamplingOptions(min_views=3, max_views=3))
+    manifest = build_shards(source, tmp_path / "shards", request)
+    assert manifest.request["problems"] == {"missing_depth": 1}
+    plain = json.loads((tmp_path / "shards" / MANIFEST_NAME).read_bytes())
     assert plain["request"]["problems"] == {"missing_depth": 1}

@@ -1,4 +1,3 @@
-import json
 import shutil
 import subprocess
 import sys
@@ -6,6 +5,7 @@ import sys
 import pytest
 
 from data_prep.cli import COMMANDS, main
+from data_prep.plan_file import read_plan
 from l3r.data.schema import read_manifest
 from l3r.export.cameras_json import read_cameras
 
@@ -70,6 +70,28 @@ def test_what_is_left_out_is_said_at_the_end_and_in_the_manifest(raw_room, tmp_p
     assert "left out: 1 missing_depth, 1 unreadable_frame" in capsys.readouterr().out
 
 
+def test_tasks_share_a_build_and_the_last_one_says_what_there_is(raw_room, tmp_path, capsys):
+    words = f"build tartanair --raw {raw_room} --scenes */P000 --out {tmp_path}"
+    words += (
+        " --graphs-per-shard 2 --num-graphs 4 --max-views 4 --min-views 3 --tasks 2 --task-index"
+    )
+    assert run(f"{words} 0") == 0
+    assert "task 0 of 2 has written its shards; others have not" in capsys.readouterr().out
+    assert run(f"{words} 1") == 0
+    assert "4 graphs in 2 shards" in capsys.readouterr().out
+    assert run(f"{words} 2") == 2
+    assert "task 2 of 2, expected a number from 0" in capsys.readouterr().err
+
+
+def test_several_tasks_do_not_render_the_same_room(tmp_path, capsys):
+    room = f"--raw {tmp_path}/raw --views 14 --held-out-views 0 --walk-views 0 --size 96x128"
+    words = f"build synthetic {room} --out {tmp_path}/out --num-graphs 2 --max-views 3 --tasks 2"
+    assert run(words) == 2
+    assert "run 'l3r-prep render' with the same options first" in capsys.readouterr().err
+    assert run(f"render {room}") == 0
+    assert run(words) == 0
+
+
 def test_the_last_frames_can_be_held_out(raw_room, tmp_path):
     words = f"build tartanair --raw {raw_room} --scenes */P000 --out {tmp_path} --held-out 0.5"
     assert run(f"{words} --num-graphs 4 --max-views 4 --min-views 3") == 0
@@ -77,8 +99,8 @@ def test_the_last_frames_can_be_held_out(raw_room, tmp_path):
     for part in ("train", "val"):
         manifest = read_manifest(tmp_path / part)
         assert manifest.request["source"]["held_out"] == 0.5
-        record = next((tmp_path / part / ".build").glob("*.scene.json"))
-        files[part] = json.loads(record.read_text())["fingerprint"]
+        record = next((tmp_path / part / ".build").glob("*.plan.npz"))
+        files[part] = read_plan(record).fingerprint
     assert files["train"] != files["val"]
     assert read_manifest(tmp_path / "val").num_graphs == 2
 

@@ -45,6 +45,7 @@ def test_json_holds_the_same_and_what_the_estimate_assumes(raw, capsys):
     assert plain["totals"]["scenes"] == 3
     assert plain["totals"]["images_missing"] == 1
     assert plain["assumed"]["num_graphs"] == 3
+    assert plain["assumed"]["graphs_per_image"] == 1
     names = [scene["name"] for scene in plain["scenes"]]
     assert names == ["office2/Easy/P011", "room/Easy/P000", "room/Hard/P002"]
     whole = plain["scenes"][1]
@@ -53,7 +54,10 @@ def test_json_holds_the_same_and_what_the_estimate_assumes(raw, capsys):
 
 
 def test_a_scene_has_no_more_graphs_than_pairs(raw, capsys):
-    assert run(f"tartanair --raw {raw} --json --num-graphs 1000 --max-views 4") == 0
+    assert (
+        run(f"tartanair --raw {raw} --json --num-graphs 1000 --graphs-per-image 9 --max-views 4")
+        == 0
+    )
     short = json.loads(capsys.readouterr().out)["scenes"][2]
     assert short["max_bytes"] == 10 * 4 * 120 * 160 * (DEPTH_BYTES + JPEG_BYTES)
 

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 import webdataset
 
+from data_prep.build import build_shards
 from data_prep.draw import scene_seed
 from data_prep.frames import STORABLE, FrameCache, read_depth, reduce_frame
 from data_prep.ledger import FOLDER
-from data_prep.plan import hold_out, plan_graphs
+from data_prep.plan import hold_out, plan_scene
 from data_prep.scene import Frame
-from data_prep.shards import build_shards, relative_to_first
+from data_prep.shards import relative_to_first
+from data_prep.source import HeldSource
 from data_prep.stored_size import reduced_size
 from l3r.data.schema import MANIFEST_NAME, decode_graph, load_index, read_manifest, read_members
 from l3r.errors import DataError
@@ -73,12 +75,12 @@ def test_graphs_agree_with_their_source(room_shards, room_scene):
 
 
 def test_two_builds_agree_byte_for_byte(room_shards, room_scene, tmp_path):
-    build_shards([room_scene], tmp_path, BUILD)
+    build_shards(HeldSource([room_scene]), tmp_path, BUILD)
     assert digests(tmp_path) == digests(room_shards)
 
 
 def test_the_number_of_workers_changes_no_byte(room_shards, room_scene, tmp_path):
-    build_shards([room_scene], tmp_path, BUILD, num_workers=2)
+    build_shards(HeldSource([room_scene]), tmp_path, BUILD, num_workers=2)
     assert digests(tmp_path) == digests(room_shards)
 
 
@@ -86,58 +88,62 @@ def test_a_removed_shard_comes_back_with_the_same_bytes(copied, room_scene, room
     names = [shard.name for shard in read_manifest(copied).shards]
     (copied / names[1]).unlink()
     kept = (copied / names[0]).stat().st_mtime_ns
-    build_shards([room_scene], copied, BUILD)
+    build_shards(HeldSource([room_scene]), copied, BUILD)
     assert digests(copied) == digests(room_shards)
     assert (copied / names[1]).read_bytes() == (room_shards / names[1]).read_bytes()
     assert (copied / names[0]).stat().st_mtime_ns == kept
 
 
 def test_an_interrupted_build_goes_on(room_scene, room_shards, tmp_path):
-    def stop(scene, done, total):
-        raise KeyboardInterrupt
+    def stop(name, done, total):
+        if name == "graphs written" and done:
+            raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        build_shards([room_scene], tmp_path, BUILD, report=stop)
+        build_shards(HeldSource([room_scene]), tmp_path, BUILD, report=stop)
     assert not (tmp_path / MANIFEST_NAME).exists()
     seen = []
-    build_shards([room_scene], tmp_path, BUILD, report=lambda *step: seen.append(step[1:]))
-    assert seen == [(2, 3), (3, 3)]
+    build_shards(HeldSource([room_scene]), tmp_path, BUILD, report=lambda *step: seen.append(step))
+    assert [step[1:] for step in seen if step[0] == "graphs written"] == [(0, 3), (2, 3), (3, 3)]
     assert digests(tmp_path) == digests(room_shards)
 
 
 def test_a_finished_folder_is_not_touched_even_without_its_records(copied, room_scene):
     shutil.rmtree(copied / FOLDER)
     before = {path: path.stat().st_mtime_ns for path in copied.glob("*.tar")}
-    build_shards([room_scene], copied, BUILD)
+    build_shards(HeldSource([room_scene]), copied, BUILD)
     assert before == {path: path.stat().st_mtime_ns for path in copied.glob("*.tar")}
 
 
 def test_another_request_in_the_same_folder_is_refused(copied, room_scene):
     with pytest.raises(DataError, match="begun with seed 0, asked now with 1"):
-        build_shards([room_scene], copied, replace(BUILD, seed=1))
+        build_shards(HeldSource([room_scene]), copied, replace(BUILD, seed=1))
 
 
 def test_changed_cameras_are_refused(copied, room_scene):
     frame = room_scene.frames[0]
     moved = replace(frame, world_from_cam=frame.world_from_cam + 1e-3)
     changed = replace(room_scene, frames=[moved, *room_scene.frames[1:]])
+    (copied / read_manifest(copied).shards[0].name).unlink()
     with pytest.raises(DataError, match="have changed since the build"):
-        build_shards([changed], copied, BUILD)
+        build_shards(HeldSource([changed]), copied, BUILD)
 
 
 def test_tars_of_unknown_origin_are_refused(tmp_path, room_scene):
     (tmp_path / "x.tar").write_bytes(b"")
     with pytest.raises(DataError, match="no record of a build"):
-        build_shards([room_scene], tmp_path, BUILD)
+        build_shards(HeldSource([room_scene]), tmp_path, BUILD)
 
 
 def test_scenes_without_a_graph_are_refused(tmp_path, room_scene):
     few = replace(room_scene, frames=room_scene.frames[:3])
     with pytest.raises(DataError, match="no scene yields a graph"):
-        build_shards([few], tmp_path, BUILD)
+        build_shards(HeldSource([few]), tmp_path, BUILD)
 
 
-@pytest.mark.parametrize("bad", [{"num_graphs": 0}, {"graphs_per_shard": 0}])
+@pytest.mark.parametrize(
+    "bad", [{"num_graphs": 0}, {"graphs_per_shard": 0}, {"graphs_per_image": 0.0}]
+)
 def test_requests_out_of_range_are_refused(bad):
     with pytest.raises(DataError, match="expected 1 or more"):
         replace(BUILD, **bad)
@@ -217,8 +223,8 @@ def test_held_out_frames_are_the_last_ones(room_scene):
 
 def test_a_scene_draws_the_same_graphs_whatever_stands_beside_it(room_scene):
     assert scene_seed("a", 0) != scene_seed("b", 0)
-    first = plan_graphs(room_scene, 3, 0, BUILD.sampling).graphs
-    more = plan_graphs(room_scene, 5, 0, BUILD.sampling).graphs
+    first = plan_scene(room_scene, replace(BUILD, num_graphs=3)).graphs
+    more = plan_scene(room_scene, replace(BUILD, num_graphs=5)).graphs
     assert [plan.views for plan in first] == [plan.views for plan in more[:3]]
 
 

@@ -13,6 +13,7 @@ from data_prep.surfaces import interpolate_depth
 from l3r.errors import DataError
 from l3r.geometry.camera import project, unproject
 from l3r.geometry.rigid import invert_rigid, transform_points
+from tests.data_prep.naming import assert_scenes_are_named_before_they_are_read
 from tests.data_prep.raw_writer import write_v1, write_v2
 
 RELEASES = {"tartanair": write_v1, "tartanair_v2": write_v2}
@@ -27,14 +28,6 @@ def read_all(root, dataset="tartanair", split="all", **options):
     """Scenes and what was left out."""
     problems = Problems()
     return list(read_scenes(dataset, root, split, problems=problems, **options)), problems.counts
-
-
-@pytest.fixture
-def raw(raw_room, tmp_path):
-    """A copy of the small held-out trajectory that a test may spoil."""
-    target = tmp_path / "raw" / "room000" / "Easy" / "P001"
-    shutil.copytree(raw_room / "room000" / "Easy" / "P001", target)
-    return target
 
 
 def agreement(frame, other):
@@ -189,3 +182,11 @@ def test_a_survey_counts_what_is_whole_and_what_lacks_something(raw_room, raw):
 def test_reading_starts_before_all_is_read(raw_room):
     scenes = read(raw_room, "all", problems=Problems())
     assert next(scenes).name == "room000/Easy/P000"
+
+
+def test_trajectories_are_named_before_they_are_read(raw, raw_room):
+    (raw / "image_left" / "000002_left.png").unlink()
+    names = assert_scenes_are_named_before_they_are_read("tartanair", raw.parents[2], "all")
+    assert names == ["room000/Easy/P001"]
+    names = assert_scenes_are_named_before_they_are_read("tartanair", raw_room, "all")
+    assert names == [f"room000/Easy/P{n:03d}" for n in range(3)]

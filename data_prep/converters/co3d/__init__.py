@@ -7,7 +7,7 @@ is translated, left out and held out.
 """
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
@@ -74,6 +74,7 @@ def read(
     scenes: str = "*",
     frame_step: int = 1,
     problems: Problems,
+    names: Collection[str] | None = None,
     options: Options = _DEFAULTS,
 ) -> Iterator[Scene]:
     """Find sequences and read their annotations; pixels follow when asked for.
@@ -84,6 +85,7 @@ def read(
         scenes: Pattern on ``CATEGORY/SEQUENCE``.
         frame_step: Take every so many frames of a sequence's frames in the split, by frame number.
         problems: Told about what cannot be used.
+        names: Only scenes of these names; where given, that none of them can be read is no error.
         options: Thresholds of quality, which apply to ``train`` alone, and what a frame must have.
 
     Yields:
@@ -99,15 +101,38 @@ def read(
     )
     number = 0
     for folder in folders:
-        for scene in _read_category(folder, request, problems):
+        if names is not None and not any(name.startswith(f"{folder.name}/") for name in names):
+            continue
+        for scene in _read_category(folder, request, problems, names):
             number += 1
             yield scene
-    if not number:
+    if not number and names is None:
         raise DataError(
             f"{root}: no sequence of {len(folders)} categories ({folders[0].name}, ...) in split"
             f" '{split}' that matches '{scenes}' can be used (problems: {problems.summary()});"
             " change --split or --scenes, or unpack the archives again"
         )
+
+
+def list_names(
+    root: Path,
+    split: Split,
+    *,
+    scenes: str,
+    problems: Problems,
+    options: Options = _DEFAULTS,
+) -> list[str]:
+    """List the names of what :func:`read` reads; arguments and errors are its own.
+
+    Frame annotations are not opened: some of these scenes may turn out to have no usable frame.
+    """
+    request = _Request(root=root, split=split, scenes=scenes, frame_step=1, options=options)
+    found: list[str] = []
+    for folder in find_categories(root):
+        category = _open_category(folder, request, problems)
+        if category is not None:
+            found += [f"{folder.name}/{name}" for name in category.list_sequences(split)]
+    return found
 
 
 def find_categories(root: Path) -> list[Path]:
@@ -140,7 +165,26 @@ def _is_category(path: Path) -> bool:
     return any(path.glob("*_annotations.jgz")) or any(path.glob("*/images"))
 
 
-def _read_category(folder: Path, request: _Request, problems: Problems) -> Iterator[Scene]:
+@dataclass(frozen=True, kw_only=True)
+class _Category:
+    """What is known of a category before its frames are read."""
+
+    folder: Path
+    sequences: dict[str, SequenceRecord]
+    lists: SetLists
+    is_wanted: Callable[[str], bool]
+
+    def list_sequences(self, split: Split) -> list[str]:
+        """Name the sequences asked for, sorted."""
+        members = self.lists.members(split)
+        if members is None:
+            folders = {path.parent.name for path in self.folder.glob("*/images")}
+            members = folders | self.sequences.keys()
+        return sorted(filter(self.is_wanted, members))
+
+
+def _open_category(folder: Path, request: _Request, problems: Problems) -> _Category | None:
+    """Read what says which sequences to take; None where no frame need be parsed."""
     sequences = _read_sequences(folder, problems)
     lists = SetLists()
     if request.split != "all":
@@ -148,14 +192,29 @@ def _read_category(folder: Path, request: _Request, problems: Problems) -> Itera
             lists = read_set_lists(folder / "set_lists")
         except DataError as error:
             _report(problems, "bad_set_lists", folder / "set_lists", error)
-            return
+            return None
     is_wanted = _choose(folder.name, sequences, lists, request, problems)
     if is_wanted is None:
+        return None
+    return _Category(folder=folder, sequences=sequences, lists=lists, is_wanted=is_wanted)
+
+
+def _read_category(
+    folder: Path, request: _Request, problems: Problems, names: Collection[str] | None
+) -> Iterator[Scene]:
+    category = _open_category(folder, request, problems)
+    if category is None:
         return
+
+    def is_wanted(name: str) -> bool:
+        return category.is_wanted(name) and (names is None or f"{folder.name}/{name}" in names)
+
     path = folder / "frame_annotations.jgz"
     try:
-        for name, records in group_frames(path, is_wanted, problems):
-            scene = _build_scene(f"{folder.name}/{name}", records, lists, request, problems)
+        for sequence, records in group_frames(path, is_wanted, problems):
+            name = f"{folder.name}/{sequence}"
+            with problems.about(name):
+                scene = _build_scene(name, records, category.lists, request, problems)
             if scene is not None:
                 yield scene
     except DataError as error:

@@ -5,7 +5,7 @@ Cameras are read from a COLMAP model, from nerfstudio's ``transforms.json`` or f
 to lay a scene out.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import suppress
 from fnmatch import fnmatchcase
 from functools import partial
@@ -32,6 +32,7 @@ def read(
     scenes: str = "*",
     frame_step: int = 1,
     problems: Problems,
+    names: Collection[str] | None = None,
 ) -> Iterator[Scene]:
     """Find scenes and read their cameras; pixels follow when asked for.
 
@@ -41,6 +42,7 @@ def read(
         scenes: Pattern on the names of the folders.
         frame_step: Take every so many images, by name.
         problems: Told about what cannot be used.
+        names: Only scenes of these names; where given, that none of them can be read is no error.
 
     Yields:
         One scene per folder, sorted by name. Metric where its ``scene.json`` says so. Where depth
@@ -49,27 +51,45 @@ def read(
     Raises:
         DataError: There is no scene, none is asked for, or none can be used.
     """
+    folders = _choose(root, split, scenes)
+    number = 0
+    for folder in folders:
+        if names is not None and folder.name not in names:
+            continue
+        with problems.about(folder.name):
+            scene = _read_if_whole(folder, frame_step, problems)
+        if scene is not None:
+            number += 1
+            yield scene
+    if not number and names is None:
+        raise DataError(
+            f"{root}: none of {len(folders)} scenes can be used (problems: {problems.summary()});"
+            " docs/datasets/folder.md says what a scene needs"
+        )
+
+
+def list_names(root: Path, split: Split, *, scenes: str, problems: Problems) -> list[str]:
+    """List the names of what :func:`read` reads, in its order; arguments and errors are its own."""
+    del problems  # none comes up before a scene is read
+    return [folder.name for folder in _choose(root, split, scenes)]
+
+
+def _choose(root: Path, split: Split, scenes: str) -> list[Path]:
     folders = [folder for folder in find_scenes(root) if fnmatchcase(folder.name, scenes)]
     if split == "test" or not folders:
         raise DataError(
             f"{root}: no scene in split '{split}' that matches '{scenes}'; change --scenes, or hold"
             " frames out by --held-out, since a folder has no split"
         )
-    number = 0
-    for folder in folders:
-        try:
-            scene = _read_scene(folder, frame_step, problems)
-        except DataError as error:
-            problems.add("bad_scene", folder, str(error).removeprefix(f"{folder}: "))
-            continue
-        if scene is not None:
-            number += 1
-            yield scene
-    if not number:
-        raise DataError(
-            f"{root}: none of {len(folders)} scenes can be used (problems: {problems.summary()});"
-            " docs/datasets/folder.md says what a scene needs"
-        )
+    return folders
+
+
+def _read_if_whole(folder: Path, frame_step: int, problems: Problems) -> Scene | None:
+    try:
+        return _read_scene(folder, frame_step, problems)
+    except DataError as error:
+        problems.add("bad_scene", folder, str(error).removeprefix(f"{folder}: "))
+        return None
 
 
 def find_scenes(root: Path) -> list[Path]:

@@ -6,7 +6,7 @@ indices of D2-Net and LoFTR in place of the models. A scene is one reconstructio
 translated, left out and held out.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import suppress
 from fnmatch import fnmatchcase
 from functools import partial
@@ -31,6 +31,7 @@ def read(
     scenes: str = "*",
     frame_step: int = 1,
     problems: Problems,
+    names: Collection[str] | None = None,
     include_excluded: bool = False,
 ) -> Iterator[Scene]:
     """Find reconstructions and their cameras; pixels follow when asked for.
@@ -41,6 +42,7 @@ def read(
         scenes: Pattern on ``0001/dense0``.
         frame_step: Take every so many images, by name.
         problems: Told about what cannot be used.
+        names: Only scenes of these names; where given, that none of them can be read is no error.
         include_excluded: Also take scenes that hold evaluation sets; see
             :func:`~data_prep.converters.megadepth.splits.excluded_because`.
 
@@ -52,22 +54,40 @@ def read(
         DataError: There is nothing to read, or nothing of it can be used.
     """
     number = 0
+    for source in _choose(root, split, scenes, problems, include_excluded=include_excluded):
+        if names is not None and source.name not in names:
+            continue
+        with problems.about(source.name):
+            scene = _build_scene(source, frame_step, problems)
+        if scene is not None:
+            number += 1
+            yield scene
+    if not number and names is None:
+        raise DataError(
+            f"{root}: no scene in split '{split}' that matches '{scenes}' can be used (problems:"
+            f" {problems.summary()}); change --split or --scenes, or unpack both archives"
+        )
+
+
+def list_names(
+    root: Path, split: Split, *, scenes: str, problems: Problems, include_excluded: bool = False
+) -> list[str]:
+    """List the names of what :func:`read` reads, in its order; arguments and errors are its own."""
+    chosen = _choose(root, split, scenes, problems, include_excluded=include_excluded)
+    return [source.name for source in chosen]
+
+
+def _choose(
+    root: Path, split: Split, scenes: str, problems: Problems, *, include_excluded: bool
+) -> Iterator[Source]:
     for source in find_sources(root, problems):
         if not (is_in(source.scene_id, split) and fnmatchcase(source.name, scenes)):
             continue
         reason = excluded_because(source.scene_id)
         if reason and not include_excluded:
             problems.add("excluded_scene", source.name, reason)
-            continue
-        scene = _build_scene(source, frame_step, problems)
-        if scene is not None:
-            number += 1
-            yield scene
-    if not number:
-        raise DataError(
-            f"{root}: no scene in split '{split}' that matches '{scenes}' can be used (problems:"
-            f" {problems.summary()}); change --split or --scenes, or unpack both archives"
-        )
+        else:
+            yield source
 
 
 def _build_scene(source: Source, frame_step: int, problems: Problems) -> Scene | None:

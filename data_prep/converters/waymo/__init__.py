@@ -7,7 +7,7 @@ the image was taken. See docs/datasets/waymo.md.
 """
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -35,6 +35,7 @@ def read(
     scenes: str = "*",
     frame_step: int = 1,
     problems: Problems,
+    names: Collection[str] | None = None,
     require_depth: bool = True,
 ) -> Iterator[Scene]:
     """Read segments of whichever version lies below a folder; pixels follow when asked for.
@@ -46,6 +47,7 @@ def read(
         scenes: Pattern on ``SPLIT/CONTEXT``.
         frame_step: Take every so many frames of a segment, before stationary ones are left out.
         problems: Told what is left out.
+        names: Only scenes of these names; where given, that none of them can be read is no error.
         require_depth: Leave out frames without range images; else their depth is unknown
             everywhere.
 
@@ -58,9 +60,13 @@ def read(
     chosen = _choose(root, split, scenes, problems)
     num_scenes = 0
     for segment in chosen:
-        frames = _read_frames(segment, frame_step, problems, require_depth=require_depth)
+        if names is not None and segment.name not in names:
+            continue
+        with problems.about(segment.name):
+            frames = _read_frames(segment, frame_step, problems, require_depth=require_depth)
+            if not frames:
+                problems.add("empty_scene", segment.path, f"{segment.name}: no frame can be used")
         if not frames:
-            problems.add("empty_scene", segment.path, f"{segment.name}: no frame can be used")
             continue
         num_scenes += 1
         yield Scene(
@@ -70,11 +76,16 @@ def read(
             frames=frames,
             has_sparse_depth=True,
         )
-    if not num_scenes:
+    if not num_scenes and names is None:
         raise DataError(
             f"{root}: no frame of {len(chosen)} segments can be used: {problems.summary()};"
             " download them again, with all components"
         )
+
+
+def list_names(root: Path, split: Split, *, scenes: str, problems: Problems) -> list[str]:
+    """List the names of what :func:`read` reads, in its order; arguments and errors are its own."""
+    return [segment.name for segment in _choose(root, split, scenes, problems)]
 
 
 def survey(root: Path) -> Iterator[SceneSurvey]:

@@ -20,6 +20,7 @@ from tests.data_prep.co3d.writer import (
     write_lists,
     write_sequence,
 )
+from tests.data_prep.naming import assert_scenes_are_named_before_they_are_read
 
 BASE = "apple/110_13051_23361"
 IMAGE, DEPTH = f"{BASE}/images/frame000004.jpg", f"{BASE}/depths/frame000004.jpg.geometric.png"
@@ -265,3 +266,12 @@ def test_missing_files_show_in_the_survey(root, written):
     (line,) = survey(root)
     assert (line.num_images, line.num_missing, line.image_size) == (3, 1, (128, 96))
     assert line.excluded == "held out for testing"
+
+
+@pytest.mark.parametrize("split", ["train", "all"])
+def test_sequences_are_named_before_they_are_read(root, written, split):
+    records = [*written[1], *write_sequence(root, Recipe(sequence="111_1_1"))]
+    write_category(root, records)
+    (root / f"{BASE}/images/frame000004.jpg").unlink()
+    names = assert_scenes_are_named_before_they_are_read("co3d", root, split)
+    assert names == [BASE, "apple/111_1_1"]

@@ -20,6 +20,7 @@ from tests.data_prep.folder.writers import (
     write_model,
     write_photos,
 )
+from tests.data_prep.naming import assert_scenes_are_named_before_they_are_read
 
 # Bilinear resampling of a texture of ten pixels' wavelength blurs and shifts it by so much [px].
 RESAMPLED = 0.1
@@ -307,3 +308,9 @@ def test_numbers_in_names_are_ordered_by_their_value(text_scene):
     (text_scene / "images" / "im 1.png").rename(text_scene / "images" / "im 10.png")
     scene, _ = read_one(text_scene.parent)
     assert [frame.name for frame in scene.frames] == [f"im {n}.png" for n in (0, 2, 3, 4, 10)]
+
+
+def test_scenes_are_named_before_they_are_read(colmap_scenes):
+    root, written = colmap_scenes
+    names = assert_scenes_are_named_before_they_are_read("folder", root)
+    assert names == sorted(name.lower() for name in written)

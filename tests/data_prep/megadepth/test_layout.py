@@ -19,6 +19,7 @@ from l3r.errors import DataError
 from tests.data_prep.folder.analytic import photograph_pinhole, shift_between
 from tests.data_prep.folder.geometry import HALF, agree, view_of
 from tests.data_prep.megadepth.writers import LENS, RAW, write_depth
+from tests.data_prep.naming import assert_scenes_are_named_before_they_are_read
 
 
 @pytest.fixture
@@ -259,3 +260,7 @@ def test_numbers_that_are_not_finite_are_unknown(merged, spoilable):
     found = scene.frames[1].read_depth()
     assert (found[0, :3] == 0).all()
     assert (found[0, 3:] == 3).all()
+
+
+def test_reconstructions_are_named_before_they_are_read(merged):
+    assert assert_scenes_are_named_before_they_are_read("megadepth", merged[0]) == ["0001/dense0"]

@@ -9,6 +9,7 @@ from data_prep.converters.waymo import MIN_MOVE, MIN_TURN, read, survey, thin_st
 from data_prep.converters.waymo.moment import Moment
 from data_prep.problems import Problems
 from l3r.errors import DataError
+from tests.data_prep.naming import assert_scenes_are_named_before_they_are_read
 from tests.data_prep.waymo import drive
 from tests.data_prep.waymo.conftest import read_one
 from tests.data_prep.waymo.parquet_writer import write_v2
@@ -223,3 +224,8 @@ def test_a_record_that_fails_its_checksum_is_counted_and_the_rest_kept(roots, tm
     assert len(scene.frames) == 10
     assert str(path) in problems.first["bad_crc"].where
     assert segment.frames[1].timestamp not in {int(f.name.split("_")[0]) for f in scene.frames}
+
+
+@pytest.mark.parametrize("kind", ["v1", "v2"])
+def test_segments_are_named_before_they_are_read(roots, kind):
+    assert len(assert_scenes_are_named_before_they_are_read("waymo", roots[kind])) == 1
