@@ -5,7 +5,7 @@ tars, and records both. The task that finds all tars there writes the manifest. 
 the same scene may both plan it: they come to the same plan.
 """
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -77,7 +77,8 @@ def build_shards(
     if missing:
         with open_pool(num_workers) as pool:
             # Enough to keep workers busy while the next scene is read, and no more in memory.
-            _Run(build, pool, missing, report, problems).write(source, 2 * num_workers + 1)
+            at_once = 2 * num_workers + 1
+            _Run(build, pool, missing, report, problems, at_once=at_once).write(source)
     gone = [unit.name for unit in mine if ledger.find_shard(unit.name) is None]
     if gone:
         raise DataError(
@@ -112,13 +113,21 @@ class _Run:
     """One task's work: scenes come in one by one, and each tar is written once its scenes are."""
 
     def __init__(
-        self, build: _Build, pool: Executor, units: list[Unit], report: Report, problems: Problems
+        self,
+        build: _Build,
+        pool: Executor,
+        units: list[Unit],
+        report: Report,
+        problems: Problems,
+        *,
+        at_once: int,
     ) -> None:
         self.ledger = build.ledger
         self.request = build.request
         self.pool = pool
         self.report = report
         self.problems = problems
+        self.at_once = at_once
         self.users: dict[str, list[Unit]] = {}
         for unit in units:
             for part in unit.parts:
@@ -126,17 +135,18 @@ class _Run:
         self.seen: set[str] = set()
         self.planned: set[str] = set()
         self.scenes: dict[str, Scene] = {}
+        self.ready: deque[Unit] = deque()
         self.work: dict[Future[Any], Callable[[Any], None]] = {}
         self.graphs = [0, sum(unit.room for unit in units)]
 
-    def write(self, source: SceneSource, at_once: int) -> None:
-        """Plan what is not planned and write every unit, with so many jobs under way."""
+    def write(self, source: SceneSource) -> None:
+        """Plan what is not planned and write every unit."""
         self._tell()
         try:
             for scene in source.read(self.users.keys(), self.problems):
                 if scene.name in self.users and scene.name not in self.seen:
                     self._take(scene)
-                    self._collect(at_once)
+                    self._collect(self.at_once - 1)
             for name in [*self.users]:
                 if name not in self.seen:
                     self._miss(name)
@@ -171,12 +181,12 @@ class _Run:
         self._settle(name)
 
     def _settle(self, name: str) -> None:
-        """Begin the units whose scenes are all planned now."""
+        """Make ready the units whose scenes are all planned now."""
         self.planned.add(name)
         self.report("scenes related", len(self.planned), len(self.users))
         for unit in self.users[name]:
             if all(part.scene in self.planned for part in unit.parts):
-                self._begin(unit)
+                self.ready.append(unit)
 
     def _begin(self, unit: Unit) -> None:
         names = [part.scene for part in unit.parts]
@@ -203,15 +213,17 @@ class _Run:
     def _tell(self) -> None:
         self.report("graphs written", *self.graphs)
 
-    def _collect(self, most: int) -> None:
-        """Take results until no more than so many are under way."""
-        while self.work:
-            ready = [future for future in self.work if future.done()]
-            if not ready:
-                if len(self.work) <= most:
+    def _collect(self, left: int) -> None:
+        """Begin what is ready and take results until no more than so many jobs are under way."""
+        while True:
+            while self.ready and len(self.work) < self.at_once:
+                self._begin(self.ready.popleft())
+            done = [future for future in self.work if future.done()]
+            if not done:
+                if not self.ready and len(self.work) <= left:
                     return
-                ready = list(wait(self.work, return_when=FIRST_COMPLETED).done)
-            for future in ready:
+                done = list(wait(self.work, return_when=FIRST_COMPLETED).done)
+            for future in done:
                 self.work.pop(future)(future.result())
 
 

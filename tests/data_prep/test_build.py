@@ -136,6 +136,20 @@ def test_a_shard_that_vanishes_while_others_are_written_is_named(three_scenes, t
     assert contents(out) == contents(tmp_path / "whole")
 
 
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_tar_is_recorded_before_the_next_ones_are_all_written(three_scenes, tmp_path, workers):
+    """Else a build that is killed begins anew."""
+    lead = []
+
+    def watch(name, done, total):
+        records = {path.stem for path in (tmp_path / FOLDER).glob("*.tar.json")}
+        lead.append(len({path.name for path in tmp_path.glob("*.tar")} - records))
+
+    request = replace(BUILD, graphs_per_shard=1)
+    build_shards(three_scenes, tmp_path, request, num_workers=workers, report=watch)
+    assert max(lead) <= 2 * workers + 1
+
+
 def test_a_plan_comes_back_as_it_was_written(room_scene, tmp_path):
     plan = plan_scene(room_scene, BUILD, {"missing_depth": 2})
     write_plan(tmp_path / "plan.npz", plan)
