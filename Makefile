@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: install demo test test-slow lint fmt types arch check bench
+.PHONY: install demo test test-slow test-slurm lint fmt types arch check bench
 
 install: $(STAMP)
 
@@ -21,7 +21,11 @@ test: install
 	$(BIN)/python -m pytest
 
 test-slow: install
-	$(BIN)/python -m pytest -m "slow and not gpu"
+	$(BIN)/python -m pytest -m "slow and not gpu and not slurm"
+
+# On a real SLURM of two nodes, which it starts and ends; docs/cluster.md says what it needs.
+test-slurm: install
+	$(BIN)/python -m pytest -m slurm -v -rs tests/slurm
 
 lint: install
 	$(BIN)/ruff check .
