@@ -142,6 +142,8 @@ class SlurmCluster:
             60,
             lambda: f"job {job} does not come back to the queue\n{self._report(job)}",
         )
+        # A node refuses a job that starts in the very second in which it was killed there.
+        time.sleep(2)
         self.run("scontrol", "update", f"jobid={job}", "StartTime=now")
 
     def cancel(self, job: str) -> None:
@@ -149,7 +151,10 @@ class SlurmCluster:
         self.run("scancel", job)
 
     def signal(self, job: str, name: str) -> None:
-        """Send a signal, such as ``USR1``, to all steps of a job; not to the batch shell."""
+        """Send a signal, such as ``USR1``, to all steps of a job, or to one (``ID.0``).
+
+        The batch shell gets none. ``KILL`` to a whole job cancels it.
+        """
         self.run("scancel", f"--signal={name}", job)
 
     def output(self, job: str) -> str:

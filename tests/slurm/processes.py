@@ -53,8 +53,8 @@ def _belongs(pid: int, folder: Path, node: str | None) -> bool:
         if name.startswith(_STEP):
             # It writes its title over its environment; what it has open is the node's log.
             logs = [slurmd_log(folder, node)] if node else list(folder.glob("slurmd-*.log"))
-            opened = {os.readlink(link) for link in (process / "fd").iterdir()}
-            return any(str(log) in opened for log in logs)
+            opened = {link.readlink() for link in (process / "fd").iterdir()}
+            return any(log in opened for log in logs)
         environment = _environment(process)
         if environment.get("SLURM_CONF") != str(folder / "slurm.conf"):
             return False

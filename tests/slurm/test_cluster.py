@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -105,7 +106,6 @@ def test_a_job_that_fails_is_reported_with_its_output(cluster, tmp_path):
     assert "so it was" in str(caught.value)
 
 
-@pytest.mark.usefixtures("live_cluster")
 def test_a_second_cluster_stands_beside_the_first_and_leaves_nothing(cluster, tmp_path):
     with SlurmCluster() as second:
         job = second.sbatch("#!/usr/bin/env bash\nsrun sleep 600\n", cwd=tmp_path)
@@ -134,7 +134,7 @@ def test_what_a_killed_run_leaves_is_ended_by_the_next(cluster, tmp_path):
         stdout=subprocess.PIPE,
         text=True,
     )
-    folder = type(cluster.folder)(run.stdout.readline().strip())
+    folder = Path(run.stdout.readline().strip())
     run.send_signal(signal.SIGKILL)
     run.wait()
     assert "slurmstepd" in {_name(pid) for pid in find_processes(folder)}
@@ -145,5 +145,4 @@ def test_what_a_killed_run_leaves_is_ended_by_the_next(cluster, tmp_path):
 
 
 def _name(pid):
-    with open(f"/proc/{pid}/comm") as stream:
-        return stream.read().strip()
+    return Path(f"/proc/{pid}/comm").read_text().strip()
