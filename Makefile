@@ -25,7 +25,7 @@ test-slow: install
 
 # On a real SLURM of two nodes, which it starts and ends; docs/cluster.md says what it needs.
 test-slurm: install
-	$(BIN)/python -m pytest -m slurm -v -rs tests/slurm
+	$(BIN)/python -m pytest -m slurm -v tests/slurm
 
 lint: install
 	$(BIN)/ruff check .

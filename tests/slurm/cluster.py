@@ -131,6 +131,18 @@ class SlurmCluster:
 
         self._poll(arrived, timeout, lambda: f"job {job} is not {state}\n{self._report(job)}")
 
+    def wait_output(self, job: str, text: str, timeout: float = 60) -> None:
+        """Wait until a job has written a text; a job that is RUNNING may not have begun to.
+
+        Raises:
+            ClusterError: It takes too long.
+        """
+        self._poll(
+            lambda: text in self.output(job),
+            timeout,
+            lambda: f"job {job} has not written '{text}'\n{self._report(job)}",
+        )
+
     def requeue(self, job: str) -> None:
         """Send a job back to the queue; it waits two minutes there, or for ``release``."""
         self.run("scontrol", "requeue", job)

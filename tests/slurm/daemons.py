@@ -6,6 +6,7 @@ them and get SIGTERM from the kernel when it dies, however it dies. Job steps ou
 shall on a cluster: they are ended by ``end_leftovers`` when the next cluster starts.
 """
 
+import contextlib
 import fcntl
 import getpass
 import os
@@ -149,27 +150,20 @@ class Daemons:
             )
 
 
-def end_leftovers() -> list[Path]:
+def end_leftovers() -> None:
     """End what killed runs have left, and remove their folders.
 
     A folder is locked while its cluster lives; one that can be locked belongs to nobody.
-
-    Returns:
-        The folders removed.
     """
-    removed = []
     for folder in Path(tempfile.gettempdir()).glob(f"{PREFIX}*"):
-        if folder.is_symlink() or folder.stat().st_uid != os.geteuid():
-            continue
-        with (folder / "lock").open("a") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+        # Another run may be at the same work.
+        with contextlib.suppress(FileNotFoundError, BlockingIOError):
+            if folder.is_symlink() or folder.stat().st_uid != os.geteuid():
                 continue
-            end_processes(folder)
-            shutil.rmtree(folder)
-            removed.append(folder)
-    return removed
+            with (folder / "lock").open("a") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                end_processes(folder)
+                shutil.rmtree(folder)
 
 
 def _claim_folder() -> tuple[Path, IO[str]]:

@@ -38,7 +38,7 @@ def provide_programs() -> str:
 
 
 def _install() -> str:
-    """Run apt-get; give its last line of complaint, or nothing."""
+    """Run apt-get; give its first line of complaint, or nothing."""
     env = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
     install = (*_APT, "install", "-y", "--no-install-recommends", *PACKAGES)
     for command in ((*_APT, "update"), install):
@@ -49,6 +49,6 @@ def _install() -> str:
         except (OSError, subprocess.TimeoutExpired) as error:
             return str(error)
         if done.returncode:
-            lines = (done.stderr or done.stdout).strip().splitlines()
-            return lines[-1] if lines else f"{command[-1]}: exit code {done.returncode}"
+            errors = [line for line in done.stderr.splitlines() if line.startswith("E: ")]
+            return errors[0] if errors else f"exit code {done.returncode}"
     return ""

@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -24,13 +23,7 @@ signal.signal(signal.SIGUSR1, stop)
 print("ready", flush=True)
 time.sleep(600)
 """
-
-
-def wait_for_output(cluster, job, text, seconds=60):
-    deadline = time.monotonic() + seconds
-    while text not in cluster.output(job):
-        assert time.monotonic() < deadline, cluster.output(job)
-        time.sleep(0.2)
+LAST = "#!/usr/bin/env bash\nsrun bash -c 'echo up; exec sleep 600'\n"
 
 
 def test_a_step_runs_on_both_nodes_with_this_python_and_the_code_under_test(cluster, tmp_path):
@@ -58,7 +51,7 @@ def test_a_requeued_job_starts_again_once_it_is_released(cluster, tmp_path):
         '[ "${SLURM_RESTART_COUNT:-0}" = 1 ] || sleep 600\n'
     )
     job = cluster.sbatch(script, cwd=tmp_path, requeue=True, open_mode="append")
-    wait_for_output(cluster, job, "run 0")
+    cluster.wait_output(job, "run 0")
     cluster.requeue(job)
     cluster.release(job)
     cluster.wait(job)
@@ -69,7 +62,7 @@ def test_a_requeued_job_starts_again_once_it_is_released(cluster, tmp_path):
 def test_a_signal_to_a_job_reaches_python(cluster, tmp_path):
     (tmp_path / "catch.py").write_text(CATCH)
     job = cluster.sbatch("#!/usr/bin/env bash\nsrun python catch.py\n", cwd=tmp_path)
-    wait_for_output(cluster, job, "ready")
+    cluster.wait_output(job, "ready")
     cluster.signal(job, "USR1")
     cluster.wait(job)
     assert "got SIGUSR1" in cluster.output(job)
@@ -90,7 +83,7 @@ def test_a_job_whose_node_goes_away_starts_again_elsewhere(cluster, tmp_path):
         '[ "$SLURMD_NODENAME" = n2 ] || exec srun sleep 600\n'
     )
     job = cluster.sbatch(script, cwd=tmp_path, requeue=True, open_mode="append")
-    wait_for_output(cluster, job, "run on n1")
+    cluster.wait_output(job, "run on n1")
     cluster.kill_node("n1")
     assert not find_processes(cluster.folder, "n1")
     cluster.release(job)
@@ -108,8 +101,7 @@ def test_a_job_that_fails_is_reported_with_its_output(cluster, tmp_path):
 
 def test_a_second_cluster_stands_beside_the_first_and_leaves_nothing(cluster, tmp_path):
     with SlurmCluster() as second:
-        job = second.sbatch("#!/usr/bin/env bash\nsrun sleep 600\n", cwd=tmp_path)
-        second.wait(job, "RUNNING")
+        second.wait_output(second.sbatch(LAST, cwd=tmp_path), "up\n")
         names = {_name(pid) for pid in find_processes(second.folder)}
         assert {"munged", "slurmctld", "slurmd", "slurmstepd", "sleep"} <= names
     assert not find_processes(second.folder)
@@ -122,13 +114,13 @@ def test_what_a_killed_run_leaves_is_ended_by_the_next(cluster, tmp_path):
         "import sys, time\nfrom pathlib import Path\n"
         "from tests.slurm.cluster import SlurmCluster\n"
         "with SlurmCluster() as running:\n"
-        "    job = running.sbatch('#!/bin/sh\\nsrun sleep 600\\n', cwd=Path(sys.argv[1]))\n"
-        "    running.wait(job, 'RUNNING')\n"
+        "    job = running.sbatch(sys.argv[1], cwd=Path(sys.argv[2]))\n"
+        "    running.wait_output(job, 'up')\n"
         "    print(running.folder, flush=True)\n"
         "    time.sleep(600)\n"
     )
     run = subprocess.Popen(
-        [sys.executable, "-c", code, str(tmp_path)],
+        [sys.executable, "-c", code, LAST, str(tmp_path)],
         cwd=ROOT,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,
@@ -138,8 +130,9 @@ def test_what_a_killed_run_leaves_is_ended_by_the_next(cluster, tmp_path):
     run.send_signal(signal.SIGKILL)
     run.wait()
     assert "slurmstepd" in {_name(pid) for pid in find_processes(folder)}
-    assert folder in end_leftovers()
+    end_leftovers()
     assert not find_processes(folder)
+    assert not folder.exists()
     assert cluster.folder.exists()
     cluster.wait_idle()
 

@@ -139,7 +139,7 @@ def test_an_installation_that_fails_is_told_with_its_reason(monkeypatch, tmp_pat
     monkeypatch.setattr(programs, "SEARCH_PATH", "/nowhere")
     monkeypatch.setattr(os, "geteuid", lambda: 0)
     (tmp_path / "apt-get").write_text(
-        "#!/bin/sh\necho first >&2\necho 'E: no network' >&2\nexit 100\n"
+        "#!/bin/sh\necho W: odd >&2\necho E: no network >&2\nexit 100\n"
     )
     (tmp_path / "apt-get").chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
