@@ -5,8 +5,8 @@
 #
 #   sbatch --array=0-15 slurm/build_shards.sh tartanair --raw TartanAir/ --out shards/tartanair
 #
-# Requeued or submitted again, with whatever array, it goes on where it stopped. To redo tasks 3
-# and 7 of 16 while the others run: sbatch --array=3,7 slurm/build_shards.sh ... --tasks 16
+# Requeued, or submitted again when none of its jobs is left, it goes on where it stopped. To redo
+# tasks 3 and 7 of 16 while others run: sbatch --array=3,7 slurm/build_shards.sh ... --tasks 16
 # Account, partition, modules and Python come from slurm/site.env; see docs/cluster.md.
 #SBATCH --job-name=l3r-shards
 #SBATCH --array=0-7
