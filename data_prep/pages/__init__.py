@@ -1,0 +1,1 @@
+"""Pages that show stored graphs: one HTML file each, no network, no script."""
