@@ -15,6 +15,7 @@ COMMANDS = {
     "render": "render a synthetic room into TartanAir's raw layout",
     "cameras": "write the true cameras of one raw scene",
     "check": "measure whether shards hold what they claim",
+    "show": "draw one graph of a folder of shards",
 }
 """Summary of each command; it lives in ``data_prep.commands`` under its name."""
 

@@ -55,6 +55,18 @@ def measure_graph(sample: GraphSample) -> list[PairMeasure]:
     ]
 
 
+def measure_pair(sample: GraphSample, i: int, j: int) -> PairMeasure:
+    """Measure one ordered pair of a graph; all NaN where nothing of i's depth is known.
+
+    Args:
+        sample: The graph.
+        i: Image whose pixels go.
+        j: Image they go to.
+    """
+    stored = float(sample.pairs.covisible[i, j])
+    return _measure_pair(_View.of(sample, i), _View.of(sample, j), stored)
+
+
 @dataclass(frozen=True, kw_only=True)
 class _View:
     """One image, ready to be compared."""

@@ -5,6 +5,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, TypeVar
 
 import cv2
@@ -112,7 +113,7 @@ def _find_damaged(members: Mapping[str, Any]) -> str:
     names = [
         name
         for name, data in members.items()
-        if name.endswith(".jpg") and _listen(lambda data=data: _decode(data))[1]
+        if name.endswith(".jpg") and _listen(partial(_decode, data))[1]
     ]
     return (
         f"{', '.join(names)}: damaged JPEG data, decoded in part; rebuild it with l3r-prep, or"

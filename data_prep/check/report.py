@@ -24,9 +24,10 @@ class Verdict:
     at_most: float | None = None
     """Highest value allowed."""
     form: str
-    """How the value is written: a format of one number, with its unit."""
-    limit_form: str
-    """How a limit is written, without unit where ``form`` has it."""
+    """How the measured value is written: a format of one number; limits get as many digits as they
+    have."""
+    unit: str = ""
+    """What follows a number."""
 
     @property
     def passed(self) -> bool:
@@ -38,18 +39,22 @@ class Verdict:
     @property
     def measured_text(self) -> str:
         """The value as it is shown."""
-        return self.form.format(self.measured) if self.measured == self.measured else _UNMEASURED
+        if self.measured != self.measured:
+            return _UNMEASURED
+        return self.form.format(self.measured) + self.unit
 
     @property
     def allowed_text(self) -> str:
         """The limits as they are shown."""
-        low, high = (
-            None if limit is None else self.limit_form.format(limit)
-            for limit in (self.at_least, self.at_most)
-        )
-        if low is not None and high is not None:
-            return f"{low} to {high}"
-        return f"{low} or more" if high is None else f"{high} or less"
+        low, high = (self._limit_text(limit) for limit in (self.at_least, self.at_most))
+        if self.at_least is None:
+            return f"{high} or less"
+        return f"{low} or more" if self.at_most is None else f"{low} to {high}"
+
+    def _limit_text(self, limit: float | None) -> str:
+        if limit is None:
+            return ""
+        return f"{100 * limit:g}%" if self.form.endswith("%}") else f"{limit:g}{self.unit}"
 
     def __str__(self) -> str:
         """One line: quantity, what was found, what was expected."""
@@ -135,51 +140,73 @@ class CheckReport:
         """Hold the files against their limits: no damaged tar, few bad graphs."""
         return [
             Verdict(
-                quantity="damaged tars",
-                measured=self.num_damaged_tars,
-                at_most=0,
-                form="{:.0f}",
-                limit_form="{:g}",
+                quantity="damaged tars", measured=self.num_damaged_tars, at_most=0, form="{:.0f}"
             ),
             Verdict(
                 quantity="share of bad graphs",
                 measured=self.bad_share,
                 at_most=limits.max_bad_share,
                 form="{:.2%}",
-                limit_form="{:.3%}",
             ),
         ]
 
     def geometry_verdicts(self, limits: Limits) -> list[Verdict]:
         """Hold what was measured in the pixels against its limits."""
-        bounds = {
-            "share of overlapping pairs that connect": (
-                self.connected, limits.min_connected, None, "{:.2f}", "{:g}",
+        found = [
+            Verdict(
+                quantity="share of overlapping pairs that connect",
+                measured=self.connected,
+                at_least=limits.min_connected,
+                form="{:.2f}",
             ),
-            "depth disagreement": (
-                self.depth_error, None, limits.max_depth_error, "{:.4%}", "{:.3%}",
+            Verdict(
+                quantity="depth disagreement",
+                measured=self.depth_error,
+                at_most=limits.max_depth_error,
+                form="{:.4%}",
             ),
-            "depth bias": (self.depth_bias, None, limits.max_depth_bias, "{:.4%}", "{:.3%}"),
-            "round trip error": (
-                self.round_trip, None, limits.max_round_trip, "{:.3f} px", "{:g}",
+            Verdict(
+                quantity="depth bias",
+                measured=self.depth_bias,
+                at_most=limits.max_depth_bias,
+                form="{:.4%}",
             ),
-            "brightness correlation": (self.color, limits.min_color, None, "{:.2f}", "{:g}"),
-            "share of known depth": (
-                self.valid_depth, limits.min_valid_depth, None, "{:.4f}", "{:g}",
+            Verdict(
+                quantity="round trip error",
+                measured=self.round_trip,
+                at_most=limits.max_round_trip,
+                form="{:.3f}",
+                unit=" px",
             ),
-        }  # fmt: skip
-        if self.is_metric:
-            bounds["median depth"] = (self.median_depth, *METRIC_DEPTH, "{:.3g} m", "{:g}")
+            Verdict(
+                quantity="brightness correlation",
+                measured=self.color,
+                at_least=limits.min_color,
+                form="{:.2f}",
+            ),
+            Verdict(
+                quantity="share of known depth",
+                measured=self.valid_depth,
+                at_least=limits.min_valid_depth,
+                form="{:.4f}",
+            ),
+        ]
+        return found + self._scale_verdicts()
+
+    def _scale_verdicts(self) -> list[Verdict]:
+        """Metres can be told from millimetres; a scene without a unit can have any scale."""
+        if not self.is_metric:
+            return []
+        low, high = METRIC_DEPTH
         return [
             Verdict(
-                quantity=quantity,
-                measured=measured,
+                quantity="median depth",
+                measured=self.median_depth,
                 at_least=low,
                 at_most=high,
-                form=form,
-                limit_form=limit_form,
+                form="{:.3g}",
+                unit=" m",
             )
-            for quantity, (measured, low, high, form, limit_form) in bounds.items()
         ]
 
     def verdicts(self, limits: Limits) -> list[Verdict]:

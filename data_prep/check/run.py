@@ -93,9 +93,7 @@ def check_shards(
     return _summarize(folder, manifest, tars, found, options)
 
 
-def _join_tars(
-    folder: Path, manifest: Manifest, options: CheckOptions, progress: Progress
-) -> Tars:
+def _join_tars(folder: Path, manifest: Manifest, options: CheckOptions, progress: Progress) -> Tars:
     tars = Tars()
     parts = check_tars(folder, manifest, digests=options.digests)
     for done, part in enumerate(parts, start=1):

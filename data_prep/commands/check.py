@@ -9,7 +9,7 @@ off, other camera axes, inverted cameras, range in place of depth, images of ano
 Besides it writes report.html, one page to open from disk: verdict, faults, histograms of overlap,
 angles, scores and depth, and some graphs with their images, depth and tree.
 
-examples:
+for example:
   l3r-prep check shards/tartanair
   l3r-prep check shards --digests --all
   l3r-prep check shards/a shards/b --report both.html
@@ -74,18 +74,22 @@ def run(args: argparse.Namespace) -> int:
         raise DataError(f"--max-bad-share is {args.max_bad_share}, expected 0 to 1")
     page = None if args.report is None else _page_path(args.report)
     folders = {path: find_folders(path) for path in args.shards}
-    num_folders = max(map(len, folders.values())) if page is None else sum(map(len, folders.values()))
+    num_folders = (
+        max(map(len, folders.values())) if page is None else sum(map(len, folders.values()))
+    )
     sections = {
         path: [_check(args, folder, num_folders) for folder in parts]
         for path, parts in folders.items()
     }
     everything = [section for parts in sections.values() for section in parts]
-    sys.stdout.write("".join(_describe(section, as_json=args.json) for section in everything))
+    pages: list[Path | None] = []
     if page is not None:
-        _write(page, everything)
+        pages = [_write(page, everything)]
     elif not args.no_report:
-        for path, parts in sections.items():
-            _write_beside(path / _NAME, parts)
+        pages = [_write_beside(path / _NAME, parts) for path, parts in sections.items()]
+    sys.stdout.write("".join(_describe(section, as_json=args.json) for section in everything))
+    if not args.json:
+        sys.stdout.write("".join(f"{written}\n" for written in pages if written))
     failed = [_complain(section) for section in everything if not section.passed]
     if failed:
         raise DataError("; ".join(failed))
@@ -127,19 +131,20 @@ def _check(args: argparse.Namespace, folder: Path, num_folders: int) -> "Section
     return Section(report=report, limits=limits, sheets=sheets)
 
 
-def _write(page: Path, sections: list["Section"]) -> None:
+def _write(page: Path, sections: list["Section"]) -> Path:
     from data_prep.pages.check_page import render_check
 
     write_atomic(page, render_check(sections))
-    sys.stderr.write(f"{page}\n")
+    return page
 
 
-def _write_beside(page: Path, sections: list["Section"]) -> None:
+def _write_beside(page: Path, sections: list["Section"]) -> Path | None:
     """Write the page that nobody asked for; shards may lie where nobody may write."""
     try:
-        _write(page, sections)
+        return _write(page, sections)
     except OSError as error:
         _LOG.warning("%s: not written (%s); --report PATH writes it elsewhere", page, error)
+        return None
 
 
 def _complain(section: "Section") -> str:

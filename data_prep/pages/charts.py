@@ -62,7 +62,9 @@ def draw_histogram(histogram: Histogram) -> Chart:
         f"{low:.3g} to {high:.3g}{unit}: {count}"
         for low, high, count in zip(edges, edges[1:], counts[first:last], strict=False)
     ]
-    ticks = _log_ticks(edges) if histogram.is_log else _even_ticks(float(edges[0]), float(edges[-1]))
+    ticks = (
+        _log_ticks(edges) if histogram.is_log else _even_ticks(float(edges[0]), float(edges[-1]))
+    )
     marks = np.log(ticks) if histogram.is_log else np.array(ticks)
     return Chart(
         title=histogram.title,
@@ -119,9 +121,7 @@ def _used_bins(histogram: Histogram) -> tuple[int, int]:
     return 0, len(histogram.counts) if histogram.edges[-1] != 180 else max(8, last)
 
 
-def _to_x(
-    places: Float64[np.ndarray, " e"], marks: Float64[np.ndarray, " m"]
-) -> list[float]:
+def _to_x(places: Float64[np.ndarray, " e"], marks: Float64[np.ndarray, " m"]) -> list[float]:
     span = places[-1] - places[0]
     return [round(LEFT + float(x) * (RIGHT - LEFT), 1) for x in (marks - places[0]) / span]
 
@@ -137,9 +137,7 @@ def _bars(
             # A single graph among a million must still be seen.
             height = max(1.0, round(count / highest * (BOTTOM - TOP), 1))
             width = round(max(0.8, x[bin_ + 1] - x[bin_] - 0.8), 1)
-            bar = Bar(
-                x=x[bin_], y=BOTTOM - height, width=width, height=height, title=titles[bin_]
-            )
+            bar = Bar(x=x[bin_], y=BOTTOM - height, width=width, height=height, title=titles[bin_])
             bars.append(bar)
     return bars
 
@@ -147,9 +145,7 @@ def _bars(
 def _count_ticks(highest: int) -> list[Tick]:
     highest = max(1, highest)
     ticks = [t for t in _even_ticks(0.0, float(highest)) if t == int(t)]
-    return [
-        Tick(at=round(BOTTOM - t / highest * (BOTTOM - TOP), 1), text=_short(t)) for t in ticks
-    ]
+    return [Tick(at=round(BOTTOM - t / highest * (BOTTOM - TOP), 1), text=_short(t)) for t in ticks]
 
 
 def _short(count: float) -> str:

@@ -4,9 +4,12 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+
 from data_prep.check.tars import StoredGraph
 from data_prep.pages.pictures import DepthScale, Picture, depth_picture, image_picture
 from data_prep.pages.tree_plan import TreePlan, draw_tree
+from data_prep.surfaces import is_scattered
 from l3r.data.schema import GraphSample
 
 THUMBNAIL = 200
@@ -41,6 +44,8 @@ class Sheet:
     """What shows it larger."""
     scale: DepthScale | None
     """What the colours of depth span; None where nothing is known."""
+    is_scattered: bool
+    """Whether depth is drawn as dots over the image."""
     tree: TreePlan | None
     """None for a single image."""
     views: list[ViewCard]
@@ -64,6 +69,7 @@ def draw_sheet(stored: StoredGraph, sample: GraphSample, long_side: int = THUMBN
         scene=sample.scene,
         command=show_command(stored.shard.parent, stored.entry.key),
         scale=scale,
+        is_scattered=any(is_scattered(torch.from_numpy(depth)) for depth in sample.depth),
         tree=tree,
         views=[
             ViewCard(

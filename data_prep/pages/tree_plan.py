@@ -10,7 +10,7 @@ from l3r.config import GraphConfig
 from l3r.graph.trees import build_tree
 from l3r.types import SceneTree
 
-_LEVEL, _ROW, _MARGIN = 92, 38, 22
+_LEVEL, _ROW, _MARGIN = 104, 38, 22
 _LABEL_AT = 0.6
 """Where along an edge its label stands: nearer the child, where edges have parted."""
 
@@ -74,9 +74,7 @@ def draw_tree(iou: Float64[np.ndarray, "n n"]) -> TreePlan:
         start, end = position[parent], position[child]
         x, y = (a + _LABEL_AT * (b - a) for a, b in zip(start, end, strict=True))
         label = f"{iou[parent, child]:.2f}"
-        edges.append(
-            Edge(parent=parent, child=child, start=start, end=end, label=label, at=(x, y))
-        )
+        edges.append(Edge(parent=parent, child=child, start=start, end=end, label=label, at=(x, y)))
     return TreePlan(
         width=deepest + _MARGIN,
         height=(num_leaves - 1) * _ROW + 2 * _MARGIN,
