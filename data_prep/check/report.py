@@ -140,7 +140,10 @@ class CheckReport:
         """Hold the files against their limits: no damaged tar, few bad graphs."""
         return [
             Verdict(
-                quantity="damaged tars", measured=self.num_damaged_tars, at_most=0, form="{:.0f}"
+                quantity="damaged tars",
+                measured=float(self.num_damaged_tars),
+                at_most=0.0,
+                form="{:.0f}",
             ),
             Verdict(
                 quantity="share of bad graphs",

@@ -176,5 +176,5 @@ def _summarize(
     )
 
 
-def _share(part: float, whole: int) -> float:
+def _share(part: float | int, whole: int) -> float:
     return part / whole if whole else float("nan")

@@ -9,8 +9,7 @@ from jaxtyping import Float64, Int64
 
 from data_prep.check.histograms import Histogram
 
-WIDTH, HEIGHT = 360, 190
-LEFT, RIGHT, TOP, BOTTOM = 46, 350, 12, 146
+LEFT, RIGHT, TOP, BOTTOM = 46.0, 350.0, 12.0, 146.0
 """Where the axes stand."""
 _MAX_TICKS = 6
 

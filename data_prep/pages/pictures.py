@@ -92,7 +92,7 @@ def depth_picture(
         long_side: Pixels of the longer side, or the map's own where that is less.
     """
     if is_scattered(torch.from_numpy(depth)):
-        return _encode(_draw_dots(depth, _shrink(image, long_side), scale))
+        return _encode(_draw_dots(depth, _shrink(image, long_side), scale), has_dots=True)
     height, width = _shrink(image, long_side).shape[:2]
     small = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST)
     row, column = np.mgrid[:height, :width]
@@ -127,9 +127,13 @@ def _shrink(image: UInt8[np.ndarray, "h w 3"], long_side: int) -> UInt8[np.ndarr
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
-def _encode(image: UInt8[np.ndarray, "h w 3"]) -> Picture:
-    bgr = np.ascontiguousarray(image[..., ::-1])
-    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+def _encode(image: UInt8[np.ndarray, "h w 3"], *, has_dots: bool = False) -> Picture:
+    # Half the resolution of colour would take the colour out of dots.
+    sampling = (
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444 if has_dots else cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420
+    )
+    options = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
+    _, data = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), options)
     text = base64.b64encode(data.tobytes()).decode()
     height, width = image.shape[:2]
     return Picture(uri=f"data:image/jpeg;base64,{text}", width=width, height=height)

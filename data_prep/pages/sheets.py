@@ -79,7 +79,7 @@ def draw_sheet(stored: StoredGraph, sample: GraphSample, long_side: int = THUMBN
                 depth=depth_picture(
                     sample.depth[view],
                     sample.image[view],
-                    scale or DepthScale(low=1, high=10, unit=""),
+                    scale or DepthScale(low=1.0, high=10.0, unit=""),
                     long_side,
                 ),
                 size="{1} x {0}".format(*sample.image_size[view]),

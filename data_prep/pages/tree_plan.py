@@ -10,7 +10,7 @@ from l3r.config import GraphConfig
 from l3r.graph.trees import build_tree
 from l3r.types import SceneTree
 
-_LEVEL, _ROW, _MARGIN = 104, 38, 22
+_LEVEL, _ROW, _MARGIN = 104.0, 38.0, 22.0
 _LABEL_AT = 0.6
 """Where along an edge its label stands: nearer the child, where edges have parted."""
 
@@ -100,6 +100,6 @@ def _place(
     if below[view]:
         y = float(np.mean([position[child][1] for child in below[view]]))
     else:
-        y, next_row = float(_MARGIN + next_row * _ROW), next_row + 1
-    position[view] = (float(_MARGIN + level * _LEVEL), y)
+        y, next_row = _MARGIN + next_row * _ROW, next_row + 1
+    position[view] = (_MARGIN + level * _LEVEL, y)
     return next_row

@@ -73,7 +73,9 @@ def test_half_a_pixel_is_found_under_noise_that_is_larger(room_shards, tmp_path)
     reports = []
     for name, mistake in (("clean", noise), ("planted", lambda s: half_a_pixel(noise(s)))):
         (tmp_path / name).mkdir()
-        reports.append(check_shards(plant(room_shards, tmp_path / name, mistake), CheckOptions(max_graphs=3)))
+        reports.append(
+            check_shards(plant(room_shards, tmp_path / name, mistake), CheckOptions(max_graphs=3))
+        )
     clean, planted = reports
     assert clean.find_faults(NOISY) == []
     assert clean.depth_error > 0.003
