@@ -166,9 +166,9 @@ def _log_ticks(edges: Float64[np.ndarray, " e"]) -> list[float]:
     """Give powers of ten, or 1, 2 and 5 times them where the range is short."""
     low, high = float(edges[0]), float(edges[-1])
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    for factors in ((1,), (1, 2, 5), (1, 2, 3, 4, 5, 6, 7, 8, 9)):
+    for factors, enough in (((1,), 3), ((1, 2, 5), 2), (range(1, 10), 0)):
         ticks = [f * 10.0**p for p in powers for f in factors if low <= f * 10.0**p <= high]
-        if len(ticks) >= 3:
+        if len(ticks) >= enough:
             break
     return ticks
 

@@ -239,9 +239,15 @@ def test_faults_beyond_the_first_of_a_kind_are_counted_not_listed():
     assert set(faults.counts) <= set(KINDS)
 
 
+COUNTED = ("graph_sizes", "image_sizes", "image_uses", "faults.counts", "problems")
+"""Where keys are what was counted."""
+
+
 def paths(value, name=""):
     """Every key of a JSON value with the type of what it holds."""
-    if isinstance(value, dict):
+    if name in COUNTED:
+        yield f"{name}.* {'int' if all(type(n) is int for n in value.values()) else '?'}"
+    elif isinstance(value, dict):
         for key, inner in sorted(value.items()):
             yield from paths(inner, f"{name}.{key}" if name else key)
     elif isinstance(value, list):
