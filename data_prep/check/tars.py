@@ -10,7 +10,7 @@ from l3r.data.schema import IndexEntry, Manifest, ShardEntry, load_index, read_m
 from l3r.errors import DataError
 
 _PARTS = ("train", "val")
-_REBUILD = "remove it and run the same l3r-prep build again"
+_REBUILD = "remove it and run the same l3r-prep build again, or copy it anew"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +97,10 @@ class _TarError(DataError):
 
 def _open_tar(path: Path, shard: ShardEntry, *, digests: bool) -> list[StoredGraph]:
     if not path.is_file():
-        raise _TarError("missing_tar", f"no such file in {path.parent}; {_REBUILD}")
+        raise _TarError(
+            "missing_tar",
+            f"no such file in {path.parent}; run the same l3r-prep build again, or copy it there",
+        )
     size = path.stat().st_size
     if size != shard.bytes:
         detail = f"{size} bytes, the manifest says {shard.bytes} bytes; {_REBUILD}"

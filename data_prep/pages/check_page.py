@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from data_prep.check import LIMITS, NOISY, CheckReport, Limits
-from data_prep.check.faults import KINDS
+from data_prep.check.faults import KINDS, LISTED_EACH
 from data_prep.pages.charts import Chart, draw_counts, draw_histogram
 from data_prep.pages.render import render
 from data_prep.pages.sheets import Sheet
@@ -39,6 +39,7 @@ def render_check(sections: list[Section]) -> str:
     return render(
         "check.html",
         passed=all(section.passed for section in sections),
+        listed_each=LISTED_EACH,
         sections=[_fill(section) for section in sections],
     )
 

@@ -139,7 +139,7 @@ def _pair_rows(sample: GraphSample, edges: list[tuple[int, int]]) -> list[PairRo
                     j=j,
                     is_edge=frozenset((i, j)) in joined,
                     iou=float(pairs.iou[i, j]),
-                    score=float(pairs.score[i, j]),
+                    score=float(pairs.score[i, j]) + 0.0,  # no -0
                     rotation=float(np.degrees(pairs.rotation[i, j])),
                     axis=float(np.degrees(pairs.axis[i, j])),
                     parallax=None if parallax != parallax else parallax,
