@@ -11,6 +11,7 @@ from data_prep.check.graphs import GraphError, read_graph
 from data_prep.check.report import CheckReport
 from data_prep.check.survey import Survey, camera_distances, median_depths
 from data_prep.check.tars import StoredGraph, Tars, check_tars
+from data_prep.ledger import PROBLEMS
 from data_prep.roundtrip import PairMeasure, measure_graph, median
 from l3r.data.schema import GraphSample, Manifest, read_manifest
 from l3r.errors import DataError
@@ -33,11 +34,6 @@ class CheckOptions:
     """Read every tar and compare its SHA-256 with the manifest's."""
     num_shown: int = 0
     """Graphs handed on to be drawn, spread evenly over those measured."""
-
-    def __post_init__(self) -> None:
-        """Check ranges."""
-        if self.max_graphs < 1:
-            raise DataError(f"--max-graphs is {self.max_graphs}, expected 1 or more")
 
 
 Progress = Callable[[str, int, int], None]
@@ -144,7 +140,7 @@ def _summarize(
     survey.finish()
     connected = [m for m in measures if m.share >= CONNECTED]
     overlapping = [m for m in measures if m.stored_covisible >= OVERLAPPING]
-    problems = manifest.request.get("problems", {})
+    problems = manifest.request.get(PROBLEMS, {})
     return CheckReport(
         folder=str(folder),
         dataset=manifest.dataset,

@@ -72,6 +72,8 @@ def run(args: argparse.Namespace) -> int:
     use_one_thread()
     if args.max_bad_share is not None and not 0 <= args.max_bad_share <= 1:
         raise DataError(f"--max-bad-share is {args.max_bad_share}, expected 0 to 1")
+    if args.max_graphs < 1:
+        raise DataError(f"--max-graphs is {args.max_graphs}, expected 1 or more")
     page = None if args.report is None else _page_path(args.report)
     folders = {path: find_folders(path) for path in args.shards}
     num_folders = (

@@ -14,7 +14,7 @@ scene's own inside ``with problems.about(name)``, and left out; DataError is for
 nothing can be read. Every convention of the source is translated there, once: K in pixels with the
 centre of the top-left pixel at (0.5, 0.5), OpenCV camera axes, ``world_from_cam`` rigid, depth z,
 0 where unknown. ``survey`` lists what is there in seconds, without pixels. Give the data set limits
-in ``data_prep/check.py`` once they were measured.
+in ``data_prep/check/limits.py`` once they were measured.
 """
 
 import importlib

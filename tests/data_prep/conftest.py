@@ -66,3 +66,16 @@ def raw(raw_room, tmp_path):
     target = tmp_path / "raw" / "room000" / "Easy" / "P001"
     shutil.copytree(raw_room / "room000" / "Easy" / "P001", target)
     return target
+
+
+@pytest.fixture
+def complaint(capsys):
+    """Gives the one line in which a command complained; lines of progress stand beside it."""
+
+    def read():
+        lines = capsys.readouterr().err.splitlines()
+        (line,) = [line for line in lines if line.startswith("l3r-prep ")]
+        assert lines[-1] == line
+        return line
+
+    return read

@@ -147,7 +147,7 @@ TAR_DAMAGE = {
 
 
 @pytest.mark.parametrize("name", list(TAR_DAMAGE))
-def test_a_damaged_tar_loses_its_graphs_and_the_others_are_read(folder, capsys, name):
+def test_a_damaged_tar_loses_its_graphs_and_the_others_are_read(folder, complaint, name):
     spoil, kind, words = TAR_DAMAGE[name]
     tar, lost = damage.first_tar(folder), read_manifest(folder).shards[0].num_graphs
     spoil(tar)
@@ -159,8 +159,7 @@ def test_a_damaged_tar_loses_its_graphs_and_the_others_are_read(folder, capsys, 
     assert report.num_read == 5 - lost
     assert report.bad_share == pytest.approx(lost / 5)
     assert check(folder, "--digests", "--max-bad-share", "1") == 2
-    message = capsys.readouterr().err
-    assert message.count("\n") == 1
+    message = complaint()
     assert "damaged tars 1, expected 0 or less" in message
     assert f"{kind}: {tar.name}: " in message
 
@@ -212,12 +211,11 @@ def test_of_a_sample_the_share_stands_for_the_rest(folder):
     assert report.bad_share == pytest.approx(0.5)
 
 
-def test_nothing_that_can_be_read_is_one_line_without_geometry(folder, capsys):
+def test_nothing_that_can_be_read_is_one_line_without_geometry(folder, complaint):
     for shard in read_manifest(folder).shards:
         (folder / shard.name).unlink()
     assert check(folder) == 2
-    message = capsys.readouterr().err
-    assert message.count("\n") == 1
+    message = complaint()
     assert "share of bad graphs 100.00%" in message
     assert "depth" not in message
 
