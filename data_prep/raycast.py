@@ -33,10 +33,10 @@ def render(
     """
     height, width = image_size
     device = room.base.device
+    depth = render_depth(room, K, world_from_cam, image_size)
     world_from_cam = world_from_cam.to(device, torch.float32)
     centers = pixel_centers(height, width, like=room.base)
     rays_from_pixels = torch.linalg.inv(K.to(device, torch.float64)).float()
-    depth, _, _ = _cast(room, _rays(centers, rays_from_pixels), world_from_cam)
     offset = pixel_centers(2, 2, like=room.base) / 2 - 0.5
     samples = (centers[:, None] + offset).reshape(-1, 2)
     rays = _rays(samples, rays_from_pixels)
@@ -47,7 +47,20 @@ def render(
         .reshape(-1, height * width, 4, 3)
         .mean(2)
     )
-    return color.reshape(-1, height, width, 3), depth.reshape(-1, height, width)
+    return color.reshape(-1, height, width, 3), depth
+
+
+def render_depth(
+    room: Room,
+    K: Float[Tensor, "3 3"],
+    world_from_cam: Float[Tensor, "n 4 4"],
+    image_size: tuple[int, int],
+) -> Float[Tensor, "n h w"]:
+    """Give the depth that :func:`render` gives, without its images, at a fifth of the cost."""
+    centers = pixel_centers(*image_size, like=room.base)
+    rays = _rays(centers, torch.linalg.inv(K.to(room.base.device, torch.float64)).float())
+    depth, _, _ = _cast(room, rays, world_from_cam.to(room.base.device, torch.float32))
+    return depth.reshape(-1, *image_size)
 
 
 def _rays(

@@ -88,12 +88,20 @@ def build_room(seed: int, *, num_boxes: int = 4, num_spheres: int = 2) -> Room:
         half_size=half_size,
         center=center,
         radius=radius,
-        **_draw_textures(6 * (num_boxes + 1) + num_spheres, draw),
+        **draw_textures(6 * (num_boxes + 1) + num_spheres, draw),
     )
 
 
-def _draw_textures(num_surfaces: int, draw: torch.Generator) -> dict[str, Tensor]:
-    """Colours far apart, waves of 0.8 to 3 m: not aliased at 48 pixels and 90 degrees."""
+def draw_textures(num_surfaces: int, draw: torch.Generator) -> dict[str, Tensor]:
+    """Draw colours far apart, and waves of 0.8 to 3 m: not aliased at 48 pixels and 90 degrees.
+
+    Args:
+        num_surfaces: How many surfaces.
+        draw: Where randomness comes from.
+
+    Returns:
+        ``base``, ``frequency``, ``phase`` and ``amplitude`` of a :class:`Room`.
+    """
     shape = (num_surfaces, NUM_WAVES)
     direction = torch.randn(*shape, 3, generator=draw)
     wavelength = 0.8 * (3.0 / 0.8) ** torch.rand(*shape, 1, generator=draw)
@@ -134,7 +142,7 @@ def draw_cameras(room: Room, num_views: int, seed: int) -> Float[Tensor, "n 4 4"
     # A target right above or below would leave the heading to chance.
     target[:, 2] = position[:, 2] + 0.5 * (target[:, 2] - position[:, 2])
     roll = 0.15 * torch.randn(num_views, generator=draw)
-    return _look(position.double(), (target - position).double(), roll.double())
+    return look_along(position.double(), (target - position).double(), roll.double())
 
 
 def draw_walk(room: Room, num_views: int, seed: int) -> Float[Tensor, "n 4 4"]:
@@ -163,7 +171,7 @@ def draw_walk(room: Room, num_views: int, seed: int) -> Float[Tensor, "n 4 4"]:
     forward = _inside(room, sway) - position
     forward[:, 2] *= 0.5
     roll = 0.05 * torch.sin(5 * angle)
-    return _look(position.double(), forward.double(), roll.double())
+    return look_along(position.double(), forward.double(), roll.double())
 
 
 def _loop(num_views: int) -> Float[Tensor, " n"]:
@@ -209,10 +217,19 @@ def _turn_down(angle: Float[Tensor, " k"]) -> Float[Tensor, "k 3 3"]:
     return R
 
 
-def _look(
+def look_along(
     position: Float[Tensor, "n 3"], forward: Float[Tensor, "n 3"], roll: Float[Tensor, " n"]
 ) -> Float[Tensor, "n 4 4"]:
-    """Cameras at positions, z along ``forward``, y down before the roll [rad]."""
+    """Place cameras, z along ``forward``, y down before the roll.
+
+    Args:
+        position: Camera centres.
+        forward: Directions, of any length.
+        roll: Turns about the optical axis [rad].
+
+    Returns:
+        ``world_from_cam``.
+    """
     z = torch.nn.functional.normalize(forward, dim=-1)
     down = torch.tensor([0.0, 0.0, 1.0], dtype=z.dtype).expand_as(z)
     x = torch.nn.functional.normalize(torch.linalg.cross(down, z), dim=-1)
