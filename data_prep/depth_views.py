@@ -37,7 +37,7 @@ class DepthViews:
     Images of several sizes are padded with what is unknown.
     """
 
-    pts3d_world: Float[Tensor, "n p 3"]
+    pts3d_world: Float[Tensor, "n 3 p"]
     """Grid points of each view, about the scene's middle; zero where unknown."""
     valid: Bool[Tensor, "n p"]
     """Whether the depth of a grid point is known."""
@@ -165,13 +165,13 @@ def stack_views(
     num_points = max(len(view.valid) for view in thin)
     height = max(view.depth.shape[0] for view in thin) + 2
     width = max(view.depth.shape[1] for view in thin) + 2
-    pts3d_world = torch.zeros(len(thin), num_points, 3)
+    pts3d_world = torch.zeros(len(thin), 3, num_points)
     valid = torch.zeros(len(thin), num_points, dtype=torch.bool)
     depth = torch.full((len(thin), height, width), torch.inf)
     for number, (view, camera) in enumerate(zip(thin, scene.world_from_cam, strict=True)):
         world = view.pts3d_cam @ camera[:3, :3].T + (camera[:3, 3] - middle)
         world = np.where(view.valid[:, None], world, 0)
-        pts3d_world[number, : len(view.valid)] = torch.from_numpy(world).float()
+        pts3d_world[number, :, : len(view.valid)] = torch.from_numpy(world.T).float()
         valid[number, : len(view.valid)] = torch.from_numpy(view.valid)
         rows, columns = view.depth.shape
         depth[number, 1 : rows + 1, 1 : columns + 1] = view.depth

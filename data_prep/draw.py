@@ -2,15 +2,16 @@
 
 import hashlib
 import logging
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
-import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 
-from data_prep.covisibility import OverlapTable, build_table, median_parallax, pairs_of
+from data_prep.candidates import choose_pairs
+from data_prep.covisibility import read_own_overlap, relate_pairs
 from data_prep.depth_views import DepthViews
 from data_prep.graph_sampling import SamplingOptions, sample_graphs
+from data_prep.overlap_table import OverlapTable, all_pairs
 from data_prep.scene import Scene
 from l3r.data.schema import PairTable
 
@@ -32,7 +33,7 @@ class GraphPlan:
 def draw_graphs(
     scene: Scene, views: DepthViews, num_graphs: int, seed: int, options: SamplingOptions
 ) -> list[GraphPlan]:
-    """Relate all images of a scene and draw its graphs.
+    """Relate the images of a scene and draw its graphs.
 
     Args:
         scene: Frames with depth.
@@ -47,14 +48,14 @@ def draw_graphs(
     Raises:
         DataError: The scene's own overlap is damaged.
     """
-    table = build_table(scene, views)
+    relations = SceneRelations(scene, views, options)
     graphs = sample_graphs(
-        table.iou.numpy(),
-        table.score.numpy(),
-        table.angle.numpy(),
+        relations.table,
+        scene.world_from_cam[:, :3, :3],
         num_graphs,
         seed=scene_seed(scene.name, seed),
         options=options,
+        overlap_of=relations.overlap_of,
     )
     if len(graphs) < num_graphs:
         _LOG.warning(
@@ -64,12 +65,12 @@ def draw_graphs(
             options.min_views,
             num_graphs,
         )
-    parallax = _parallax_of(views, graphs)
+    known = relations.known(graphs)
     return [
         GraphPlan(
             key=f"{scene.dataset}-{scene.slug}-{number:06d}",
             views=graph,
-            pairs=_take_pairs(table, parallax, graph),
+            pairs=known.among(graph),
         )
         for number, graph in enumerate(graphs)
     ]
@@ -80,26 +81,47 @@ def scene_seed(name: str, seed: int) -> int:
     return int.from_bytes(hashlib.sha256(f"{seed}:{name}".encode()).digest()[:4], "big")
 
 
-def _parallax_of(views: DepthViews, graphs: list[list[int]]) -> Float32[np.ndarray, "n n"]:
-    """Median parallax of all pairs that share a graph; NaN elsewhere."""
-    parallax = np.full((views.num_views, views.num_views), np.nan, dtype=np.float32)
-    np.fill_diagonal(parallax, 0)
-    pairs = sorted({pair for graph in graphs for pair in pairs_of(graph)})
-    if pairs:
-        index = torch.tensor(pairs, device=views.center.device)
-        first, second = np.array(pairs).T
-        parallax[first, second] = median_parallax(views, index).cpu().numpy()
-        parallax[second, first] = parallax[first, second]
-    return parallax
+class SceneRelations:
+    """What is known of a scene's pairs: the candidates, and whatever was asked for besides.
 
+    Args:
+        scene: Frames with depth.
+        views: That depth, prepared for look-ups.
+        options: Thresholds of the sampler.
 
-def _take_pairs(
-    table: OverlapTable, parallax: Float32[np.ndarray, "n n"], graph: list[int]
-) -> PairTable:
-    """Cut a graph's rows and columns out of the scene's tables."""
-    rows = np.ix_(graph, graph)
-    tables = {
-        f.name: parallax if f.name == "parallax" else getattr(table, f.name).numpy()
-        for f in fields(PairTable)
-    }
-    return PairTable(**{name: whole[rows].astype(np.float64) for name, whole in tables.items()})
+    Attributes:
+        table: The candidates.
+    """
+
+    def __init__(self, scene: Scene, views: DepthViews, options: SamplingOptions) -> None:
+        self._scene, self._views = scene, views
+        self._own = read_own_overlap(scene)
+        pairs = choose_pairs(scene, views, self._own, options)
+        self.table = relate_pairs(scene, views, pairs, self._own)
+        self._others = self.table.take(slice(0))
+
+    def overlap_of(self, pairs: Int64[np.ndarray, "m 2"]) -> Float32[np.ndarray, " m"]:
+        """Give the IoU of pairs that are no candidates, and remember all of what they are."""
+        self._relate(pairs)
+        return self._others.iou[self._others.find(pairs)]
+
+    def known(self, graphs: list[list[int]]) -> OverlapTable:
+        """Relate all pairs of graphs.
+
+        Args:
+            graphs: View numbers.
+
+        Returns:
+            A table of these pairs at least.
+        """
+        inner = [np.array(graph)[all_pairs(len(graph))] for graph in graphs]
+        pairs = np.concatenate([*inner, np.empty((0, 2), dtype=np.int64)])
+        self._relate(pairs[self.table.find(pairs) < 0])
+        return self.table.join(self._others)
+
+    def _relate(self, pairs: Int64[np.ndarray, "m 2"]) -> None:
+        new = np.unique(np.sort(pairs[self._others.find(pairs) < 0], axis=1), axis=0)
+        if len(new):
+            self._others = self._others.join(
+                relate_pairs(self._scene, self._views, new, self._own)
+            )

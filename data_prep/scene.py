@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
+from scipy.sparse import csr_array
 
 from l3r.errors import DataError
 
@@ -42,9 +43,9 @@ class Scene:
     """In the order of the source."""
     has_sparse_depth: bool = False
     """Whether depth is known at scattered pixels only, as lidar gives it."""
-    read_overlap: Callable[[], Float64[np.ndarray, "n n"]] | None = None
-    """Give the overlap (IoU of shared 3-D points) of all pairs where the source knows it better
-    than depth reprojection does; 1 on the diagonal."""
+    read_overlap: Callable[[], csr_array] | None = None
+    """Give the overlap (IoU of shared 3-D points) of all pairs that have any, as an n x n matrix,
+    where the source knows it better than depth reprojection does; 1 on the diagonal."""
 
     @property
     def slug(self) -> str:
@@ -75,15 +76,15 @@ class Scene:
 
 
 def _cut_overlap(
-    read: Callable[[], Float64[np.ndarray, "_m _m"]], name: str, num_frames: int, views: list[int]
-) -> Float64[np.ndarray, "n n"]:
+    read: Callable[[], csr_array], name: str, num_frames: int, views: list[int]
+) -> csr_array:
     whole = read()
     if whole.shape != (num_frames, num_frames):
         raise DataError(
             f"{name}: overlap of {whole.shape} images, expected one row and column for each of"
             f" {num_frames} frames; the source's points do not belong to its images"
         )
-    return whole[np.ix_(views, views)]
+    return whole[views][:, views]
 
 
 def slug_of(name: str) -> str:

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from data_prep.raycast import render_depth
 from data_prep.room import Room, draw_textures, look_along
 
 REACH = 40.0
@@ -19,6 +20,8 @@ _FRONT = 5.0
 """Mean length of a house front [m]."""
 _SWING = 48
 """Mean number of images between two turns of the head to the same side."""
+_VIEWS_AT_ONCE = 4
+"""Views rendered together: more leaves the processor's cache."""
 
 
 def build_street(seed: int, *, length: float = 1000.0) -> Room:
@@ -91,14 +94,33 @@ def draw_stroll(street: Room, num_views: int, seed: int) -> Float[Tensor, "n 4 4
     return look_along(position, forward, 0.02 * jitter[3])
 
 
-def nearby(street: Room, position: Float[Tensor, "n 3"], distance: float) -> Room:
-    """Keep the boxes of a street that come close to a set of positions: the others cost time.
+def street_depth(
+    street: Room,
+    K: Float[Tensor, "3 3"],
+    world_from_cam: Float[Tensor, "n 4 4"],
+    image_size: tuple[int, int],
+) -> Float[Tensor, "n h w"]:
+    """Give z [m] for views of a street, 0 beyond :data:`REACH`.
 
     Args:
-        street: The street, without spheres.
-        position: Where one stands.
-        distance: Boxes farther than this from all positions are left out [m].
+        street: The street.
+        K: Intrinsics shared by all views.
+        world_from_cam: Cameras with OpenCV axes.
+        image_size: (height, width).
     """
+    # The corner of an image sees as far as its middle, measured along the axis.
+    corner = torch.linalg.inv(K.double()) @ torch.tensor([0, 0, 1.0]).double()
+    parts = []
+    for at in range(0, len(world_from_cam), _VIEWS_AT_ONCE):
+        cameras = world_from_cam[at : at + _VIEWS_AT_ONCE]
+        around = _nearby(street, cameras[:, :3, 3], REACH * float(corner.norm()))
+        parts.append(render_depth(around, K, cameras, image_size))
+    depth = torch.cat(parts)
+    return torch.where(depth <= REACH, depth, 0)
+
+
+def _nearby(street: Room, position: Float[Tensor, "n 3"], distance: float) -> Room:
+    """Keep the boxes that come closer than a distance to some position: the others cost time."""
     gap = (street.world_from_box[:, :3, 3] - position.float()[:, None]).norm(dim=-1).amin(0)
     keep = gap - street.half_size.norm(dim=-1) < distance
     keep[0] = True

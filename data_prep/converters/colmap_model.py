@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, eye_array
 from scipy.spatial.transform import Rotation
 
 from data_prep.converters.colmap_files import read_cameras, read_images, read_positions
@@ -133,7 +133,7 @@ def read_points(folder: Path, problems: Problems) -> ModelPoints:
     return ModelPoints(ids=numbers, pts3d_world=pts3d_world[good][first])
 
 
-def shared_point_overlap(folder: Path, names: tuple[str, ...]) -> Float64[np.ndarray, "n n"]:
+def shared_point_overlap(folder: Path, names: tuple[str, ...]) -> csr_array:
     """Give the overlap of images: points both see over points either sees.
 
     Args:
@@ -141,7 +141,7 @@ def shared_point_overlap(folder: Path, names: tuple[str, ...]) -> Float64[np.nda
         names: Images of the model, each once.
 
     Returns:
-        Symmetric, 1 on the diagonal, 0 beside it for an image that sees no point.
+        n x n, symmetric, with an entry for each pair that shares a point, and 1 on the diagonal.
 
     Raises:
         DataError: The model lacks one of the images.
@@ -157,11 +157,13 @@ def shared_point_overlap(folder: Path, names: tuple[str, ...]) -> Float64[np.nda
     points, column = np.unique(np.concatenate(list(seen.values())), return_inverse=True)
     # Not a sum of booleans, which would saturate at one.
     table = csr_array((np.ones(len(row)), (row, column)), shape=(len(names), len(points)))
-    both = (table @ table.T).toarray()
-    count = both.diagonal()
-    overlap: Float64[np.ndarray, "n n"] = both / np.maximum(count[:, None] + count - both, 1)
-    np.fill_diagonal(overlap, 1)
-    return overlap
+    count = table.sum(axis=1)
+    # The diagonal gets an entry for images without points, too.
+    both = (table @ table.T + eye_array(len(names))).tocoo()
+    same = both.row == both.col
+    either = count[both.row] + count[both.col] - both.data
+    overlap = np.where(same, 1, both.data / np.where(same, 1, either))
+    return csr_array((overlap, (both.row, both.col)), shape=both.shape)
 
 
 def _require(folder: Path) -> str:

@@ -103,7 +103,7 @@ def read_soundly(root):
                 check_camera(frame)
                 found[frame.name] = check_pixels(frame)
             if scene.read_overlap is not None:
-                overlap = scene.read_overlap()
+                overlap = scene.read_overlap().toarray()
                 assert overlap.shape == (len(scene.frames),) * 2
                 assert (overlap == overlap.T).all()
                 assert ((overlap >= 0) & (overlap <= 1)).all()

@@ -61,7 +61,7 @@ def read_soundly(root):
                 check_camera(frame)
                 found[frame.name] = check_pixels(frame)
             if scene.read_overlap is not None:
-                overlap = scene.read_overlap()
+                overlap = scene.read_overlap().toarray()
                 assert (overlap.diagonal() == 1).all()
                 assert ((overlap >= 0) & (overlap <= 1)).all()
     except DataError as error:
