@@ -35,9 +35,8 @@ _FEW = 64
 """Points of an image in the look at few."""
 _MORE = 1024
 """Points of an image that are sorted into voxels."""
-_DENSITY = 4
-"""Points of an image in a voxel at the median distance of what is seen, where views are 90 degrees
-wide: fewer, and images that see the same surface would meet in few voxels."""
+_DENSITY = 8
+"""Points of an image in a voxel, about: with fewer, images of one surface would meet in few."""
 _BLOCK = 2**22
 """Pairs of images compared by voxels at once."""
 _MAX_PRODUCTS = 2**31
@@ -69,7 +68,7 @@ def choose_pairs(
     distance = _median_distance(views)
     pool = [_neighbours(n)]
     if own is None:
-        blocks = _shared_voxels(_take_points(views, _MORE), distance)
+        blocks = _shared_voxels(views, distance)
     else:
         blocks = _own_blocks(own)
     for i, j, iou in blocks:
@@ -167,11 +166,14 @@ def _shared_voxels(
     views: DepthViews, distance: Float32[np.ndarray, " n"]
 ) -> Iterator[_Overlaps]:
     """Estimate the overlap of images where it is not 0."""
+    known = views.valid.sum(-1).clamp_max(_MORE).cpu().numpy()
+    if not known.any():
+        return
+    views = _take_points(views, _MORE)
     valid = views.valid.cpu().numpy()
     count = valid.sum(axis=1)
-    known = count > 0
-    # Points are this far apart at the median distance, times the root of the density.
-    size = 2 * np.median(distance[known]) / math.sqrt(np.median(count[known]) / _DENSITY)
+    # A view of 90 degrees shows a square of twice its distance.
+    size = 2 * np.median(distance[known > 0]) / math.sqrt(np.median(known[known > 0]) / _DENSITY)
     cell = np.floor(views.pts3d_world.transpose(1, 2).cpu().numpy()[valid] / size)
     # 21 bits for each axis; what is farther off shares the outermost voxels.
     x, y, z = np.clip(cell, -(2**20), 2**20 - 1).astype(np.int64).T + 2**20

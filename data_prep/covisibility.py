@@ -91,48 +91,42 @@ def relate_depth(
     parallax = np.full(len(pairs), np.nan, dtype=np.float32)
     for at in range(0, len(pairs), chunk):
         index = torch.from_numpy(pairs[at : at + chunk]).to(views.center.device)
-        common, angle = zip(
-            _relate_one_way(views, *index.unbind(1)),
-            _relate_one_way(views, *index.flip(1).unbind(1)),
-            strict=True,
-        )
-        count = torch.stack([way.sum(-1) for way in common], dim=1).cpu().numpy()
-        seen[at : at + chunk] = count
-        parallax[at : at + chunk] = _median(torch.cat(angle, dim=1), count.sum(1))
+        ways = index, index.flip(1)
+        common = torch.stack([_sees(views, *way.unbind(1)) for way in ways], dim=1)
+        count = common.sum(-1)
+        seen[at : at + chunk] = count.cpu().numpy()
+        met = count.any(dim=1).nonzero()[:, 0]
+        if len(met):
+            angle = torch.stack([_parallax(views, *way[met].unbind(1)) for way in ways], dim=1)
+            angle = torch.where(common[met], angle, torch.inf).flatten(1)
+            parallax[at + met.cpu().numpy()] = _median(angle, count[met].sum(1))
     return seen, parallax
 
 
-def _relate_one_way(
+def _parallax(
     views: DepthViews, source: Int[Tensor, " m"], target: Int[Tensor, " m"]
-) -> tuple[Bool[Tensor, "m p"], Float[Tensor, "m p"]]:
-    """Tell which grid points of source views their target views see, and at what parallax [rad].
-
-    The parallax is infinite where a point is not seen.
-    """
+) -> Float[Tensor, "m p"]:
+    """Angles C_source - X - C_target at the grid points of source views [rad]."""
     points = views.pts3d_world.index_select(0, source)
-    common = _sees(views, target, points) & views.valid.index_select(0, source)
     x, y, z = (views.center.index_select(0, source)[..., None] - points).unbind(1)
     u, v, w = (views.center.index_select(0, target)[..., None] - points).unbind(1)
     # The arc cosine would lose small angles, which are the ones asked for.
-    sine = torch.stack([y * w - z * v, z * u - x * w, x * v - y * u]).square_().sum(0).sqrt_()
-    angle = torch.atan2(sine, x * u + y * v + z * w)
-    return common, torch.where(common, angle, torch.inf)
+    sine = (y * w - z * v).square_()
+    sine.add_((z * u - x * w).square_()).add_((x * v - y * u).square_()).sqrt_()
+    return torch.atan2(sine, x * u + y * v + z * w)
 
 
 def _sees(
-    views: DepthViews, target: Int[Tensor, " m"], pts3d_world: Float[Tensor, "m 3 p"]
+    views: DepthViews, source: Int[Tensor, " m"], target: Int[Tensor, " m"]
 ) -> Bool[Tensor, "m p"]:
-    """Test which points each target view sees."""
+    """Test which known grid points of each source view its target view sees."""
+    x, y, z = views.pts3d_world.index_select(0, source).unbind(1)
     P = views.pixels_from_world.index_select(0, target)[..., None]
     # Not a matrix product, whose last bits may depend on what else is multiplied.
-    projected = [
-        (pts3d_world[:, 0] * P[:, row, 0])
-        .add_(pts3d_world[:, 1] * P[:, row, 1])
-        .add_(pts3d_world[:, 2] * P[:, row, 2])
-        .add_(P[:, row, 3])
+    x, y, z = (
+        (x * P[:, row, 0]).add_(y * P[:, row, 1]).add_(z * P[:, row, 2]).add_(P[:, row, 3])
         for row in range(3)
-    ]
-    x, y, z = projected
+    )
     in_front = z > 0
     z = z.clamp_min(1e-6)
     height, width = views.depth.shape[-2:]
@@ -141,17 +135,15 @@ def _sees(
     row = (y / z).clamp_(-1, height - 2).floor_().long().add_(1)
     column.add_(row, alpha=width).add_((target * (height * width))[:, None])
     found = views.depth.flatten().index_select(0, column.flatten()).reshape(z.shape)
-    return ((found - z).abs_() <= (RELATIVE * z).clamp_min_(views.floor)) & in_front
+    near = (found - z).abs_() <= (RELATIVE * z).clamp_min_(views.floor)
+    return near & in_front & views.valid.index_select(0, source)
 
 
-def _median(
-    angle: Float[Tensor, "m q"], count: Int64[np.ndarray, " m"]
-) -> Float32[np.ndarray, " m"]:
-    """Take the (lower) median of the finite numbers of each row; NaN where there are none."""
+def _median(angle: Float[Tensor, "m q"], count: Int[Tensor, " m"]) -> Float32[np.ndarray, " m"]:
+    """Take the (lower) median of the finite numbers of each row, of which there are ``count``."""
     # numpy's sort of rows takes a tenth of the time of torch's nanmedian.
     ordered = np.sort(angle.cpu().numpy(), axis=1)
-    middle = ordered[np.arange(len(count)), np.maximum(count - 1, 0) // 2]
-    return np.where(count > 0, middle, np.float32(np.nan))
+    return np.asarray(ordered[np.arange(len(ordered)), (count.cpu().numpy() - 1) // 2])
 
 
 def croco_score(iou: Float[Tensor, "*b"], angle: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32, Int64
+from scipy.sparse import csr_array
 
 from data_prep.candidates import choose_pairs
 from data_prep.covisibility import read_own_overlap, relate_pairs
@@ -48,9 +49,11 @@ def draw_graphs(
     Raises:
         DataError: The scene's own overlap is damaged.
     """
-    relations = SceneRelations(scene, views, options)
+    own = read_own_overlap(scene)
+    table = relate_pairs(scene, views, choose_pairs(scene, views, own, options), own)
+    relations = SceneRelations(scene, views, own, table)
     graphs = sample_graphs(
-        relations.table,
+        table,
         scene.world_from_cam[:, :3, :3],
         num_graphs,
         seed=scene_seed(scene.name, seed),
@@ -87,18 +90,15 @@ class SceneRelations:
     Args:
         scene: Frames with depth.
         views: That depth, prepared for look-ups.
-        options: Thresholds of the sampler.
-
-    Attributes:
+        own: The scene's own overlap where it has one.
         table: The candidates.
     """
 
-    def __init__(self, scene: Scene, views: DepthViews, options: SamplingOptions) -> None:
-        self._scene, self._views = scene, views
-        self._own = read_own_overlap(scene)
-        pairs = choose_pairs(scene, views, self._own, options)
-        self.table = relate_pairs(scene, views, pairs, self._own)
-        self._others = self.table.take(slice(0))
+    def __init__(
+        self, scene: Scene, views: DepthViews, own: csr_array | None, table: OverlapTable
+    ) -> None:
+        self._scene, self._views, self._own, self._table = scene, views, own, table
+        self._others = table.take(slice(0))
 
     def overlap_of(self, pairs: Int64[np.ndarray, "m 2"]) -> Float32[np.ndarray, " m"]:
         """Give the IoU of pairs that are no candidates, and remember all of what they are."""
@@ -116,8 +116,8 @@ class SceneRelations:
         """
         inner = [np.array(graph)[all_pairs(len(graph))] for graph in graphs]
         pairs = np.concatenate([*inner, np.empty((0, 2), dtype=np.int64)])
-        self._relate(pairs[self.table.find(pairs) < 0])
-        return self.table.join(self._others)
+        self._relate(pairs[self._table.find(pairs) < 0])
+        return self._table.join(self._others)
 
     def _relate(self, pairs: Int64[np.ndarray, "m 2"]) -> None:
         new = np.unique(np.sort(pairs[self._others.find(pairs) < 0], axis=1), axis=0)
