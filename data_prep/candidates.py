@@ -67,10 +67,7 @@ def choose_pairs(
     world_from_cam = scene.world_from_cam
     distance = _median_distance(views)
     pool = [_neighbours(n)]
-    if own is None:
-        blocks = _shared_voxels(views, distance)
-    else:
-        blocks = _own_blocks(own)
+    blocks = _shared_voxels(views, distance) if own is None else _own_blocks(own)
     for i, j, iou in blocks:
         angle = _rough_angle(world_from_cam, distance, i, j)
         margin = _margin(iou, angle, options)
@@ -159,12 +156,10 @@ def _rough_angle(
     rotation = np.arccos(np.clip(cos, -1, 1))
     baseline = np.linalg.norm(center[i] - center[j], axis=1)
     parallax = np.arctan2(baseline, (distance[i] + distance[j]) / 2)
-    return np.where(rotation < MIN_ROTATION, parallax, rotation)
+    return np.asarray(np.where(rotation < MIN_ROTATION, parallax, rotation))
 
 
-def _shared_voxels(
-    views: DepthViews, distance: Float32[np.ndarray, " n"]
-) -> Iterator[_Overlaps]:
+def _shared_voxels(views: DepthViews, distance: Float32[np.ndarray, " n"]) -> Iterator[_Overlaps]:
     """Estimate the overlap of images where it is not 0."""
     known = views.valid.sum(-1).clamp_max(_MORE).cpu().numpy()
     if not known.any():

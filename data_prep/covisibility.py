@@ -55,8 +55,9 @@ def relate_pairs(
     count = views.valid.sum(-1).cpu().numpy().astype(np.float32)[pairs]
     common = seen.sum(1) / 2
     iou = common / np.maximum(count.sum(1) - common, 1)
-    if own is not None:
-        iou = _look_up(own, pairs)
+    # scipy gives a sparse array for no entry at all.
+    if own is not None and len(pairs):
+        iou = np.asarray(own[pairs[:, 0], pairs[:, 1]]).astype(np.float32)
     rotation, axis = _angles(scene.world_from_cam[:, :3, :3], pairs)
     still = (rotation < MIN_ROTATION) & (iou > 0)
     angle = np.where(still, np.nan_to_num(parallax, nan=0.0), rotation)
@@ -171,22 +172,12 @@ def read_own_overlap(scene: Scene) -> csr_array | None:
     own = scene.read_overlap()
     n = len(scene.frames)
     good = own.shape == (n, n) and bool(((own.data >= 0) & (own.data <= 1)).all())
-    if not (good and (own != own.T).nnz == 0 and (own.diagonal() == 1).all()):
+    if not (good and abs(own - own.T).max() == 0 and (own.diagonal() == 1).all()):
         raise DataError(
             f"{scene.name}: its own overlap has shape {own.shape}, expected {n} x {n},"
             " symmetric, from 0 to 1, and 1 on the diagonal; the source's points are damaged"
         )
     return own
-
-
-def _look_up(own: csr_array, pairs: Int64[np.ndarray, "m 2"]) -> Float32[np.ndarray, " m"]:
-    """Give entries of a matrix, 0 where it has none."""
-    entries = own.tocoo()
-    key = entries.row.astype(np.int64) * own.shape[1] + entries.col
-    order = np.argsort(key)
-    wanted = pairs[:, 0] * own.shape[1] + pairs[:, 1]
-    at = order[np.minimum(np.searchsorted(key, wanted, sorter=order), len(key) - 1)]
-    return np.where(key[at] == wanted, entries.data[at], 0).astype(np.float32)
 
 
 def _angles(

@@ -103,7 +103,7 @@ class SceneRelations:
     def overlap_of(self, pairs: Int64[np.ndarray, "m 2"]) -> Float32[np.ndarray, " m"]:
         """Give the IoU of pairs that are no candidates, and remember all of what they are."""
         self._relate(pairs)
-        return self._others.iou[self._others.find(pairs)]
+        return np.asarray(self._others.iou[self._others.find(pairs)])
 
     def known(self, graphs: list[list[int]]) -> OverlapTable:
         """Relate all pairs of graphs.
@@ -122,6 +122,5 @@ class SceneRelations:
     def _relate(self, pairs: Int64[np.ndarray, "m 2"]) -> None:
         new = np.unique(np.sort(pairs[self._others.find(pairs) < 0], axis=1), axis=0)
         if len(new):
-            self._others = self._others.join(
-                relate_pairs(self._scene, self._views, new, self._own)
-            )
+            found = relate_pairs(self._scene, self._views, new, self._own)
+            self._others = self._others.join(found)

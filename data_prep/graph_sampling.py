@@ -197,7 +197,7 @@ class Relations:
             return np.zeros((len(views), len(self.R)), dtype=np.float32)
         cos = (self.R[views] @ self.R.T - 1) / 2
         # Rounded, so that rotations that are equal but for the last bits tie.
-        return np.arccos(np.clip(cos.round(12), 0, 1)).astype(np.float32)
+        return np.asarray(np.arccos(np.clip(cos.round(12), 0, 1)), dtype=np.float32)
 
     def least_known(self, pairs: Int64[np.ndarray, "m 2"]) -> Float32[np.ndarray, " m"]:
         """Give the IoU of pairs that the table lacks, 0 for those that it has."""
@@ -241,7 +241,7 @@ class _Growth:
         members = np.array([self.members[row] for row in rows.tolist()])
         pairs = np.stack([members, np.broadcast_to(views[:, None], members.shape)], axis=-1)
         iou = self.relations.least_known(pairs.reshape(-1, 2)).reshape(members.shape)
-        bad: Bool[np.ndarray, " r"] = (iou > max_iou).any(axis=1)
+        bad = np.asarray((iou > max_iou).any(axis=1))
         self.excluded[rows[bad], views[bad]] = True
         return bad
 

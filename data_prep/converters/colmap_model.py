@@ -157,7 +157,7 @@ def shared_point_overlap(folder: Path, names: tuple[str, ...]) -> csr_array:
     points, column = np.unique(np.concatenate(list(seen.values())), return_inverse=True)
     # Not a sum of booleans, which would saturate at one.
     table = csr_array((np.ones(len(row)), (row, column)), shape=(len(names), len(points)))
-    count = table.sum(axis=1)
+    count: Float64[np.ndarray, " n"] = np.asarray(table.sum(axis=1))
     # The diagonal gets an entry for images without points, too.
     both = (table @ table.T + eye_array(len(names))).tocoo()
     same = both.row == both.col

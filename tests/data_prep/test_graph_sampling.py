@@ -127,8 +127,7 @@ def test_start_pairs_are_drawn_in_proportion_to_their_score():
         score[i, j] = score[j, i] = s
     options = SamplingOptions(min_views=2, max_views=2)
     first = [
-        set(draw((iou, score, score), 1, seed=seed, options=options)[0])
-        for seed in range(800)
+        set(draw((iou, score, score), 1, seed=seed, options=options)[0]) for seed in range(800)
     ]
     share = first.count({0, 1}) / len(first)
     assert share == pytest.approx(0.75, abs=0.05)

@@ -116,7 +116,8 @@ def test_overlap_is_that_of_shared_points(merged):
     expected = [[len(a & b) / len(a | b) for b in sets] for a in sets]
     np.testing.assert_allclose(scene.read_overlap().toarray(), expected, atol=1e-12)
     part, _ = read_one(merged[0], frame_step=2)
-    np.testing.assert_allclose(part.read_overlap().toarray(), np.array(expected)[::2, ::2], atol=1e-12)
+    found = part.read_overlap().toarray()
+    np.testing.assert_allclose(found, np.array(expected)[::2, ::2], atol=1e-12)
 
 
 def test_scenes_travel_to_other_processes(merged):
