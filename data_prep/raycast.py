@@ -56,7 +56,17 @@ def render_depth(
     world_from_cam: Float[Tensor, "n 4 4"],
     image_size: tuple[int, int],
 ) -> Float[Tensor, "n h w"]:
-    """Give the depth that :func:`render` gives, without its images, at a fifth of the cost."""
+    """Cast one ray per pixel centre: the depth that :func:`render` gives, at a fifth of the cost.
+
+    Args:
+        room: The room, on the device to render on.
+        K: Intrinsics shared by all views, centre of the top-left pixel at (0.5, 0.5).
+        world_from_cam: Cameras with OpenCV axes.
+        image_size: (height, width).
+
+    Returns:
+        z [m].
+    """
     centers = pixel_centers(*image_size, like=room.base)
     rays = _rays(centers, torch.linalg.inv(K.to(room.base.device, torch.float64)).float())
     depth, _, _ = _cast(room, rays, world_from_cam.to(room.base.device, torch.float32))

@@ -140,8 +140,9 @@ def test_one_camera_repeated_gives_no_graph(street, caplog):
     assert "0 graphs of 5 views or more" in caplog.text
 
 
-def test_a_scene_of_too_few_images_gives_no_graph(street):
-    few = street.take(range(4))
+@pytest.mark.parametrize("num_views", [1, 2, 4])
+def test_a_scene_of_too_few_images_gives_no_graph(street, num_views):
+    few = street.take(range(num_views))
     assert draw_graphs(few, prepare_views(few), 5, 0, OPTIONS) == []
 
 
