@@ -110,13 +110,12 @@ def street_depth(
     """
     # The corner of an image sees as far as its middle, measured along the axis.
     corner = torch.linalg.inv(K.double()) @ torch.tensor([0, 0, 1.0]).double()
-    parts = []
+    depth = torch.empty(len(world_from_cam), *image_size)
     for at in range(0, len(world_from_cam), _VIEWS_AT_ONCE):
         cameras = world_from_cam[at : at + _VIEWS_AT_ONCE]
         around = _nearby(street, cameras[:, :3, 3], REACH * float(corner.norm()))
-        parts.append(render_depth(around, K, cameras, image_size))
-    depth = torch.cat(parts)
-    return torch.where(depth <= REACH, depth, 0)
+        depth[at : at + len(cameras)] = render_depth(around, K, cameras, image_size)
+    return depth.masked_fill_(depth > REACH, 0)
 
 
 def _nearby(street: Room, position: Float[Tensor, "n 3"], distance: float) -> Room:
