@@ -8,8 +8,10 @@ Three sieves, each finer than the one before and no wider than what it lets thro
    points.
 3. Of these the best are kept, each image's first choice first, until the bound is reached.
 
-Best is what clears the sampler's two thresholds, of IoU and of score, by the most. All is in fixed
-order: the same scene and options give the same pairs.
+Best is what clears the sampler's two thresholds, of IoU and of score, by the most, up to a factor
+of two. Of more pairs that are so clear than the bound allows, a lot decides that is the pair's own:
+to keep the highest scores would leave graphs of one kind of pair. The same scene and options give
+the same pairs.
 """
 
 import math
@@ -18,7 +20,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Float64, Int64
+from jaxtyping import Float, Float32, Float64, Int64, UInt64
 from scipy.sparse import csr_array, hstack
 
 from data_prep.covisibility import MIN_ROTATION, croco_score, relate_pairs
@@ -37,6 +39,8 @@ _MORE = 1024
 """Points of an image that are sorted into voxels."""
 _DENSITY = 8
 """Points of an image in a voxel, about: with fewer, images of one surface would meet in few."""
+_CLEAR = 2.0
+"""A pair that clears both thresholds by this factor is as good as any."""
 _BLOCK = 2**22
 """Pairs of images compared by voxels at once."""
 _MAX_PRODUCTS = 2**31
@@ -71,7 +75,7 @@ def choose_pairs(
     for i, j, iou in blocks:
         angle = _rough_angle(world_from_cam, distance, i, j)
         margin = _margin(iou, angle, options)
-        best = _rank(i, margin, iou, j) < _POOL * bound
+        best = _rank(i, margin, _lots(i, j)) < _POOL * bound
         pool.append(np.sort(np.stack([i[best], j[best]], axis=1), axis=1))
     pairs = np.unique(np.concatenate(pool), axis=0)
     rough = relate_pairs(scene, _take_points(views, _FEW), pairs, own)
@@ -81,20 +85,29 @@ def choose_pairs(
 def _margin(
     iou: Float32[np.ndarray, " m"], angle: Float32[np.ndarray, " m"], options: SamplingOptions
 ) -> Float32[np.ndarray, " m"]:
-    """Tell how far pairs clear the thresholds of a link, as a factor: the lesser of the two."""
+    """Tell by what factor pairs clear both thresholds of a link, no more than is clear enough."""
     score = croco_score(torch.from_numpy(iou), torch.from_numpy(angle)).numpy()
     floor = max(options.min_score, 1e-6)
-    return np.minimum(iou / np.float32(options.min_iou), score / np.float32(floor))
+    margin = np.minimum(iou / np.float32(options.min_iou), score / np.float32(floor))
+    return np.minimum(margin, np.float32(_CLEAR))
+
+
+def _lots(i: Int64[np.ndarray, " m"], j: Int64[np.ndarray, " m"]) -> UInt64[np.ndarray, " m"]:
+    """Give each pair a number that follows from it and looks drawn by chance (SplitMix64)."""
+    x = (np.minimum(i, j) << 32 | np.maximum(i, j)).astype(np.uint64)
+    x = x * np.uint64(0x9E3779B97F4A7C15)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        x = (x ^ (x >> np.uint64(shift))) * np.uint64(factor)
+    return x ^ (x >> np.uint64(31))
 
 
 def _rank(
     image: Int64[np.ndarray, " m"],
     margin: Float32[np.ndarray, " m"],
-    iou: Float32[np.ndarray, " m"],
-    partner: Int64[np.ndarray, " m"],
+    lot: UInt64[np.ndarray, " m"],
 ) -> Int64[np.ndarray, " m"]:
-    """Rank the partners of each image: by margin, then overlap, then number; the best is 0."""
-    order = np.lexsort((partner, -iou, -margin, image))
+    """Rank the pairs of each image: by margin, then by lot; the best is 0."""
+    order = np.lexsort((lot, -margin, image))
     ordered = image[order]
     rank = np.empty(len(image), dtype=np.int64)
     rank[order] = np.arange(len(image)) - np.searchsorted(ordered, ordered)
@@ -105,11 +118,11 @@ def _within_bound(rough: OverlapTable, options: SamplingOptions) -> Int64[np.nda
     """Keep neighbours and, in turns, what each image ranks first, second, and so on."""
     i, j = rough.views.T
     margin = _margin(rough.iou, rough.angle, options)
-    both = np.concatenate([i, j])
-    rank = _rank(both, np.tile(margin, 2), np.tile(rough.iou, 2), np.concatenate([j, i]))
+    lot = _lots(i, j)
+    rank = _rank(np.concatenate([i, j]), np.tile(margin, 2), np.tile(lot, 2))
     turn = rank.reshape(2, -1).min(axis=0)
     turn[j - i <= _NEIGHBOURS] = -1
-    order = np.lexsort((j, i, -rough.iou, -margin, turn))
+    order = np.lexsort((lot, -margin, turn))
     order = order[(turn[order] < 0) | (rough.iou[order] > 0)]
     kept = order[: rough.num_views * options.candidates_per_image // 2]
     return np.asarray(rough.views[np.sort(kept)])

@@ -66,28 +66,6 @@ class SamplingOptions:
             )
 
 
-def quota(num_images: int, num_graphs: int, graphs_per_image: float | None) -> int:
-    """Tell how many graphs to draw of a scene.
-
-    Args:
-        num_images: Images of the scene.
-        num_graphs: The most graphs of any scene.
-        graphs_per_image: Graphs for each image of the scene, rounded up; None: ``num_graphs`` of
-            every scene.
-
-    Raises:
-        DataError: ``graphs_per_image`` is not above 0.
-    """
-    if graphs_per_image is None:
-        return num_graphs
-    if not (math.isfinite(graphs_per_image) and graphs_per_image > 0):
-        raise DataError(
-            f"graphs per image: {graphs_per_image}, expected a number above 0; change it"
-        )
-    # 0.1 * 30 is a little more than 3.
-    return min(num_graphs, max(1, math.ceil(graphs_per_image * num_images - 1e-9)))
-
-
 def sample_graphs(
     table: OverlapTable,
     world_from_cam_R: Float64[np.ndarray, "n 3 3"],

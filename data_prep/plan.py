@@ -2,7 +2,6 @@
 
 import hashlib
 import logging
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -11,6 +10,7 @@ from data_prep.draw import GraphPlan, draw_graphs
 from data_prep.frames import read_image
 from data_prep.problems import Problem
 from data_prep.scene import Frame, Scene
+from data_prep.survey import quota
 from data_prep.units import BuildRequest
 from l3r.errors import DataError
 
@@ -82,8 +82,8 @@ def _plan_graphs(
         _LOG.warning("%s: %d frames, a graph has %d or more", scene.name, found, least)
         return []
     usable = scene.take(kept)
-    quota = min(request.num_graphs, math.ceil(request.graphs_per_image * len(kept)))
-    graphs = draw_graphs(usable, stack_views(usable, thin), quota, request.seed, request.sampling)
+    wanted = quota(len(kept), request.num_graphs, request.graphs_per_image)
+    graphs = draw_graphs(usable, stack_views(usable, thin), wanted, request.seed, request.sampling)
     return [replace(graph, views=[kept[view] for view in graph.views]) for graph in graphs]
 
 

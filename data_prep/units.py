@@ -5,6 +5,7 @@ room for ``num_graphs`` graphs, whether it fills it or not. So any number of tas
 any order, writes the same tars.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -32,7 +33,11 @@ class BuildRequest:
 
     def __post_init__(self) -> None:
         """Check ranges."""
-        if self.num_graphs < 1 or self.graphs_per_shard < 1 or not self.graphs_per_image > 0:
+        if (
+            self.num_graphs < 1
+            or self.graphs_per_shard < 1
+            or not 0 < self.graphs_per_image < math.inf
+        ):
             raise DataError(
                 f"build: {self.num_graphs} graphs, {self.graphs_per_image} per image,"
                 f" {self.graphs_per_shard} per shard, expected 1 or more, more than 0 per image;"

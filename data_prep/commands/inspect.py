@@ -9,7 +9,6 @@ example: l3r-prep inspect tartanair --raw TartanAir/ --num-graphs 1000
 
 import argparse
 import json
-import math
 import sys
 from collections import Counter
 from dataclasses import asdict, dataclass
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from data_prep.converters import CONVERTERS, survey_scenes
 from data_prep.stored_size import reduced_size
-from data_prep.survey import SceneSurvey
+from data_prep.survey import SceneSurvey, quota
 from l3r.errors import DataError
 
 if TYPE_CHECKING:
@@ -96,9 +95,9 @@ class _Row:
         size = 0
         if not left_out and scene.image_size is not None:
             height, width = reduced_size(scene.image_size)
-            quota = min(num_graphs, math.ceil(graphs_per_image * scene.num_images))
             # Each pair of images starts one graph at most.
-            graphs = min(quota, scene.num_images * (scene.num_images - 1) // 2)
+            num_pairs = scene.num_images * (scene.num_images - 1) // 2
+            graphs = min(num_pairs, quota(scene.num_images, num_graphs, graphs_per_image))
             views = min(max_views, scene.num_images)
             size = round(graphs * views * height * width * (DEPTH_BYTES + JPEG_BYTES))
         return cls(scene=scene, left_out=left_out, max_bytes=size)

@@ -12,9 +12,9 @@ from data_prep.graph_sampling import (
     Relations,
     SamplingOptions,
     grow_graphs,
-    quota,
     sample_graphs,
 )
+from data_prep.survey import quota
 from l3r.errors import DataError
 from tests.data_prep.relations import table_of
 
@@ -256,7 +256,6 @@ def test_the_quota_follows_the_images_up_to_the_limit(num_images, num_graphs, sh
     found = quota(num_images, num_graphs, share)
     assert found <= num_graphs
     assert found in (num_graphs, 1) or abs(found - share * num_images) <= 1
-    assert quota(num_images, num_graphs, None) == num_graphs
     assert quota(num_images + 1, num_graphs, share) >= found
 
 
@@ -265,12 +264,6 @@ def test_the_quota_is_rounded_up_and_not_by_the_last_bit():
     assert quota(31, 1000, 0.1) == 4
     assert quota(2, 1000, 0.1) == 1
     assert quota(500, 100, 1.0) == 100
-
-
-@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
-def test_a_quota_that_is_none_is_refused(bad):
-    with pytest.raises(DataError, match="expected a number above 0"):
-        quota(10, 10, bad)
 
 
 @pytest.mark.parametrize("bad", [{"max_uses": 0}, {"candidates_per_image": 0}])
