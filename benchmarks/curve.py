@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from l3r.config import RunConfig, load_config
-from l3r.data.loader import open_folders
+from l3r.data.source import open_folders
 from l3r.inference.checkpoint import build_untrained, load_model
 from l3r.loss.joint import JointLoss
 from l3r.loss.targets import PairTargets, build_targets
@@ -51,7 +51,7 @@ def main(argv: list[str]) -> int:
 def validation_graphs(config: RunConfig) -> ValidationGraphs:
     """Give the graphs that the run's validation scored."""
     size = (config.model.image_size[0], config.model.image_size[1])
-    folders = open_folders(config.data.validation, config.data.num_views)
+    folders = open_folders(config.data.validation, config.data)
     return ValidationGraphs(folders, size, config.train.validation_graphs)
 
 

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from l3r.config import InferenceConfig, Precision
-from l3r.data.loader import read_graph
 from l3r.data.source import ShardFolder
+from l3r.data.steps import read_graph
 from l3r.eval.graphs import evaluate_shards
 from l3r.geometry.rigid import rotation_angle
 from l3r.inference.checkpoint import build_untrained, load_model_and_config

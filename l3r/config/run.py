@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from l3r.config.check import require
 from l3r.config.data import DataConfig
 from l3r.config.graph import GraphConfig
 from l3r.config.inference import InferenceConfig
@@ -26,3 +27,13 @@ class RunConfig:
     """Optimisation."""
     inference: InferenceConfig = field(default_factory=InferenceConfig)
     """Reconstruction."""
+
+    def __post_init__(self) -> None:
+        """Check ranges across sections."""
+        patch = self.model.encoder.patch_size
+        require(
+            all(side % patch == 0 for size in self.data.image_sizes for side in size),
+            "data.image_sizes",
+            self.data.image_sizes,
+            f"multiples of model.encoder.patch_size = {patch}",
+        )

@@ -5,96 +5,78 @@ resumed run goes on with the very next sample whatever the workers had read ahea
 """
 
 import logging
+import signal
+import threading
+from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import cv2
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from l3r.config import DataConfig, SourceConfig
-from l3r.data.sampling import SampleChooser
-from l3r.data.source import ShardFolder
-from l3r.data.stages import collate, resize_crop, to_views
-from l3r.errors import ConfigError, DataError
+from l3r.config import DataConfig
+from l3r.data.sampling import SampleChooser, Variation
+from l3r.data.source import open_folders
+from l3r.data.steps import MAX_ATTEMPTS, DeviceShare, StepDataset
+from l3r.errors import ConfigError, DataError, LaunchError
 from l3r.types import Views
 
 log = logging.getLogger(__name__)
 
 LOG_SKIP_EVERY = 100
-MAX_ATTEMPTS = 20
-"""Unreadable graphs in a row after which the source is given up."""
-MIN_READ_BEFORE_STOP = 200
-"""A skip rate over fewer reads says little."""
+SKIP_WINDOW = 1000
+"""Samples over which the rate of unreadable ones is taken."""
+
+Item = TypeVar("Item")
 
 
-@dataclass(frozen=True, kw_only=True)
-class DeviceShare:
-    """The slots of a step that one device takes: ``rank``, ``rank + world_size``, ..."""
+class SkipGuard:
+    """Counts unreadable samples and stops the run where there are too many.
 
-    rank: int = 0
-    world_size: int = 1
-
-
-@dataclass(frozen=True, kw_only=True)
-class StepBatch:
-    """What a worker sends: the batch and what it had to leave out."""
-
-    views: Views | None
-    """The batch; None where no sample of a source could be read."""
-    skipped: list[str]
-    """One line for each unreadable sample, which another of the same source replaced."""
-
-    def pin_memory(self) -> "StepBatch":
-        """Pin the batch's tensors."""
-        pinned = None if self.views is None else self.views.pin_memory()
-        return StepBatch(views=pinned, skipped=self.skipped)
-
-
-class StepDataset(Dataset[StepBatch]):
-    """Batches by step number.
+    The rate is that of a device's last ``SKIP_WINDOW`` samples, so that it neither hides what
+    breaks late in a run nor needs the devices to speak to each other.
 
     Args:
-        folders: Shards of each source.
-        chooser: Says which graph stands where.
-        image_size: (height, width) of the batch.
-        share: Which slots are this device's.
+        max_rate: Share of unreadable samples that is borne.
     """
 
-    def __init__(
-        self,
-        folders: list[ShardFolder],
-        chooser: SampleChooser,
-        image_size: tuple[int, int],
-        share: DeviceShare,
-    ) -> None:
-        self.folders = folders
-        self.chooser = chooser
-        self.image_size = image_size
-        self.slots = range(share.rank, chooser.slots_per_step, share.world_size)
+    def __init__(self, max_rate: float) -> None:
+        self.max_rate = max_rate
+        self.total = 0
+        self._window: deque[bool] = deque(maxlen=SKIP_WINDOW)
 
-    def __getitem__(self, step: int) -> StepBatch:
-        """Read this device's graphs of a step."""
-        skipped: list[str] = []
-        graphs: list[Views] = []
-        for slot in self.slots:
-            source, first = self.chooser.choose(step, slot)
-            views = read_or_next(self.folders[source], first, self.image_size, skipped)
-            if views is None:
-                # Not raised here: an error that leaves a worker arrives as a traceback.
-                return StepBatch(views=None, skipped=skipped)
-            graphs.append(views)
-        return StepBatch(views=collate(graphs), skipped=skipped)
+    def count(self, num_read: int, skipped: list[str]) -> None:
+        """Take note of a batch; the first unreadable sample and each hundredth are logged.
+
+        Args:
+            num_read: Samples that could be read.
+            skipped: A line for each that could not.
+
+        Raises:
+            DataError: Too many cannot be read.
+        """
+        for line in skipped:
+            self.total += 1
+            if self.total == 1 or self.total % LOG_SKIP_EVERY == 0:
+                log.warning("sample skipped (%d so far): %s", self.total, line)
+        self._window.extend([True] * len(skipped) + [False] * num_read)
+        found = sum(self._window)
+        if found > self.max_rate * SKIP_WINDOW:
+            raise DataError(
+                f"{found} of the last {len(self._window)} samples cannot be read, more than "
+                f"data.max_skip_rate={self.max_rate} of {SKIP_WINDOW}; last: {skipped[-1]}; run "
+                "'l3r-prep check' on the shards"
+            )
 
 
 class StepLoader:
     """Endless batches from a step on, for lightning's trainer.
 
     Args:
-        dataset: Batches by step number.
-        config: ``num_workers`` and ``max_skip_rate``.
-        num_steps: Where to end.
+        dataset: Batches by number.
+        config: Processes, read-ahead and ``max_skip_rate``.
+        num_steps: Optimisation step at which to end.
         pin_memory: Whether batches go to an accelerator.
     """
 
@@ -103,71 +85,36 @@ class StepLoader:
     ) -> None:
         self.dataset = dataset
         self.config = config
-        self.num_steps = num_steps
+        self.num_batches = num_steps * dataset.share.accumulate
         self.pin_memory = pin_memory
-        self.step = 0
-        self.num_read = 0
-        self.num_skipped = 0
+        self.batch = 0
 
     def __iter__(self) -> Iterator[Views]:
         """Yield batches from the current step.
 
         Raises:
             DataError: More than ``max_skip_rate`` of the samples cannot be read.
+            LaunchError: A loader process died.
         """
-        loader = DataLoader(
-            self.dataset,
-            batch_size=None,
-            sampler=range(self.step, self.num_steps),
-            num_workers=self.config.num_workers,
-            pin_memory=self.pin_memory,
-            # Forked workers of a process that has used threads can hang; these import afresh.
-            multiprocessing_context="spawn" if self.config.num_workers else None,
-            worker_init_fn=_use_one_thread,
-        )
-        for batch in loader:
-            self._count(batch)
+        guard = SkipGuard(self.config.max_skip_rate)
+        numbers = range(self.batch, self.num_batches)
+        for batch in read_ahead(self.dataset, numbers, self.config, pin_memory=self.pin_memory):
             if batch.views is None:
                 raise DataError(
                     f"{MAX_ATTEMPTS} graphs in a row cannot be read; last: {batch.skipped[-1]}; "
-                    "check that the folder of shards is there, and run 'l3r-prep check' on it"
+                    "check that the shards are there, and run 'l3r-prep check' on them"
                 )
-            self.step += 1
+            guard.count(len(batch.views.key), batch.skipped)
+            self.batch += 1
             yield batch.views
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything a resumed run needs."""
-        return {"step": self.step}
+        """Everything a resumed run needs; a step begun is begun again."""
+        return {"step": self.batch // self.dataset.share.accumulate}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on after the step of a checkpoint."""
-        self.step = int(state["step"])
-
-    def _count(self, batch: StepBatch) -> None:
-        self.num_read += len(self.dataset.slots) + len(batch.skipped)
-        for line in batch.skipped:
-            if self.num_skipped % LOG_SKIP_EVERY == 0:
-                log.warning("sample skipped (%d so far): %s", self.num_skipped + 1, line)
-            self.num_skipped += 1
-        rate = self.num_skipped / self.num_read
-        if rate > self.config.max_skip_rate and self.num_read >= MIN_READ_BEFORE_STOP:
-            raise DataError(
-                f"{self.num_skipped} of {self.num_read} samples cannot be read, more than "
-                f"data.max_skip_rate={self.config.max_skip_rate}; last: {batch.skipped[-1:]}; "
-                "run 'l3r-prep check' on the shards"
-            )
-
-
-def open_folders(sources: dict[str, SourceConfig], num_views: int) -> list[ShardFolder]:
-    """Open the shards of every source.
-
-    Raises:
-        DataError: A folder holds no finished shards.
-    """
-    return [
-        ShardFolder(Path(source.shards), num_views, (source.span[0], source.span[1]))
-        for source in sources.values()
-    ]
+        self.batch = int(state["step"]) * self.dataset.share.accumulate
 
 
 def build_training_loader(
@@ -180,57 +127,109 @@ def build_training_loader(
 ) -> StepLoader:
     """Build the loader of a training run on one device.
 
+    Args:
+        config: Sources and batches.
+        image_size: (height, width) where ``config.image_sizes`` is empty.
+        seed: Seed of all draws.
+        num_steps: Optimisation step at which to end.
+        share: Which graphs of each step are this device's.
+
     Raises:
         ConfigError: There is no source, or the graphs of a step do not split over the devices.
-        DataError: A folder holds no finished shards.
+        DataError: A place holds no finished shards.
     """
     if not config.sources:
         raise ConfigError("data.sources is empty; add data.sources.NAME.shards=FOLDER")
-    if config.graphs_per_step % share.world_size:
+    parts = share.world_size * share.accumulate
+    if config.graphs_per_step % parts:
         raise ConfigError(
-            f"data.graphs_per_step is {config.graphs_per_step}, expected a multiple of the "
-            f"{share.world_size} devices"
+            f"data.graphs_per_step is {config.graphs_per_step}, expected a multiple of {parts}: "
+            f"{share.world_size} devices, {share.accumulate} batches each"
         )
-    folders = open_folders(config.sources, config.num_views)
+    if share.rank == 0:
+        _warn_of_idle_settings(config)
+    folders = open_folders(config.sources, config)
     weights = [source.weight for source in config.sources.values()]
     sizes = [len(folder) for folder in folders]
+    brightness, contrast, saturation, hue = config.color_jitter
+    variation = Variation(
+        image_sizes=tuple((h, w) for h, w in config.image_sizes) or (image_size,),
+        color_jitter=(brightness, contrast, saturation, hue),
+        seed=seed,
+    )
     chooser = SampleChooser(sizes, weights, config.graphs_per_step, seed)
-    dataset = StepDataset(folders, chooser, image_size, share)
+    dataset = StepDataset(folders, chooser, variation, share)
     return StepLoader(dataset, config, num_steps, pin_memory=torch.cuda.is_available())
 
 
-def read_or_next(
-    folder: ShardFolder, index: int, image_size: tuple[int, int], skipped: list[str]
-) -> Views | None:
-    """Read a graph as a batch of one; the next ones stand in for an unreadable one.
+def read_ahead(
+    dataset: Dataset[Item], numbers: range, config: DataConfig, *, pin_memory: bool
+) -> Iterator[Item]:
+    """Get items of a data set in order, from processes that work ahead.
 
     Args:
-        folder: Where it is.
-        index: Which one.
-        image_size: (height, width).
-        skipped: Receives a line for each unreadable one.
-
-    Returns:
-        None where ``MAX_ATTEMPTS`` in a row cannot be read.
-    """
-    for attempt in range(min(MAX_ATTEMPTS, len(folder))):
-        current = (index + attempt) % len(folder)
-        try:
-            return read_graph(folder, current, image_size)
-        except DataError as error:
-            skipped.append(f"{folder.key(current)}: {error}")
-    return None
-
-
-def read_graph(folder: ShardFolder, index: int, image_size: tuple[int, int]) -> Views:
-    """Read one graph as a batch of one.
+        dataset: Items by number.
+        numbers: Which, in this order.
+        config: ``num_workers`` and ``prefetch_factor``.
+        pin_memory: Whether items go to an accelerator.
 
     Raises:
-        DataError: The graph cannot be read.
+        LaunchError: A process died.
     """
-    (views,) = to_views(resize_crop([folder.read(index)], image_size=image_size))
-    return views
+    has_workers = config.num_workers > 0
+    loader = DataLoader(
+        dataset,
+        batch_size=None,
+        sampler=numbers,
+        num_workers=config.num_workers,
+        prefetch_factor=config.prefetch_factor if has_workers else None,
+        pin_memory=pin_memory,
+        # Forked workers of a process that has used threads can hang; these import afresh.
+        multiprocessing_context="spawn" if has_workers else None,
+        worker_init_fn=_settle,
+    )
+    handler = signal.getsignal(signal.SIGCHLD)
+    items = iter(loader)
+    # Torch would report a death from a signal handler, in the middle of whatever the training step
+    # does; without it the loader finds out when it is next asked for a batch.
+    if has_workers and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGCHLD, handler)
+    while True:
+        try:
+            item = next(items)
+        except StopIteration:
+            return
+        except RuntimeError as error:
+            if not str(error).startswith("DataLoader worker"):
+                raise
+            raise LaunchError(
+                f"{str(error).splitlines()[0]}; most often memory ran out: lower data.num_workers "
+                "or data.prefetch_factor, or give the job more memory (and /dev/shm); then start "
+                "the same command again"
+            ) from error
+        yield item
 
 
-def _use_one_thread(worker: int) -> None:
+def _settle(worker: int) -> None:
+    """Make a loader process quiet: one thread, and deaf to signals meant for the run."""
     torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    for number in (signal.SIGINT, signal.SIGUSR1, signal.SIGUSR2):
+        signal.signal(number, signal.SIG_IGN)
+
+
+def _warn_of_idle_settings(config: DataConfig) -> None:
+    """Name settings that do nothing in this run."""
+    places = [s.shards for s in (*config.sources.values(), *config.validation.values())]
+    is_remote = any(place.startswith(("http://", "https://")) for place in places)
+    keeps = bool(config.cache_dir and config.cache_gb)
+    changed = config.prefetch_factor != DataConfig().prefetch_factor
+    idle = [
+        (config.cache_gb and not config.cache_dir, "data.cache_gb: no data.cache_dir is given"),
+        (config.cache_dir and not config.cache_gb, "data.cache_dir: data.cache_gb is 0"),
+        (keeps and not is_remote, "data.cache_dir: no source is an http(s) address"),
+        (changed and not config.num_workers, "data.prefetch_factor: data.num_workers is 0"),
+    ]
+    for applies, words in idle:
+        if applies:
+            log.warning("no effect of %s", words)

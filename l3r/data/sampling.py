@@ -1,11 +1,15 @@
-"""Which graph stands in which slot of which step: a pure function, hence exact resume."""
+"""What stands in which slot of which step: a pure function, hence exact resume."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
-DRAW_SOURCE, SHUFFLE = 1, 2  # streams of randomness that must not meet
+from l3r.data.color import ColorChange, draw_color_changes
+
+# Streams of randomness that must not meet: the second word of every seed.
+DRAW_SOURCE, SHUFFLE, DRAW_SIZE, DRAW_COLOR = 1, 2, 3, 4
 
 
 class SampleChooser:
@@ -41,6 +45,38 @@ class SampleChooser:
         epoch, position = divmod(step * self.slots_per_step + slot, self.sizes[source])
         order = _permutation(self.seed, source, epoch, self.sizes[source])
         return source, int(order[position])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variation:
+    """How training images vary: the shape from step to step, the colours from image to image.
+
+    Shapes depend on (seed, step), so that all devices agree, and colours on (seed, step, global
+    slot, view).
+
+    Args:
+        image_sizes: (height, width), one of which each step takes.
+        color_jitter: Strengths of brightness, contrast, saturation and hue.
+        seed: Seed of all draws.
+    """
+
+    image_sizes: tuple[tuple[int, int], ...]
+    color_jitter: tuple[float, float, float, float]
+    seed: int
+
+    def draw_image_size(self, step: int) -> tuple[int, int]:
+        """Draw the (height, width) of a step's images; all are equally likely."""
+        if len(self.image_sizes) == 1:
+            return self.image_sizes[0]
+        rng = np.random.default_rng((self.seed, DRAW_SIZE, step))
+        return self.image_sizes[int(rng.integers(len(self.image_sizes)))]
+
+    def draw_colors(self, step: int, slot: int, num_views: int) -> tuple[ColorChange, ...]:
+        """Draw the change of colours of each image of one slot; empty without jitter."""
+        if not any(self.color_jitter):
+            return ()
+        rng = np.random.default_rng((self.seed, DRAW_COLOR, step, slot))
+        return draw_color_changes(rng, self.color_jitter, num_views)
 
 
 @lru_cache(maxsize=32)

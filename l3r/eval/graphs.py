@@ -11,8 +11,8 @@ from rich.progress import track
 
 from l3r.config import InferenceConfig
 from l3r.config.check import require
-from l3r.data.loader import read_graph
 from l3r.data.source import ShardFolder
+from l3r.data.steps import read_graph
 from l3r.files import write_atomic
 from l3r.inference.reconstruct import reconstruct_views
 from l3r.metrics.cameras import CameraMetrics, camera_metrics, mean_metrics

@@ -13,8 +13,11 @@ from l3r.inference.checkpoint import read_checkpoint
 from l3r.model.weight_files import write_checkpoint
 
 FREE_TO_CHANGE = {
+    "data.cache_dir",
+    "data.cache_gb",
     "data.max_skip_rate",
     "data.num_workers",
+    "data.prefetch_factor",
     "train.accelerator",
     "train.checkpoint_every",
     "train.gradient_checkpointing",

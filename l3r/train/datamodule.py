@@ -7,14 +7,9 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from l3r.config import RunConfig
-from l3r.data.loader import (
-    DeviceShare,
-    StepLoader,
-    build_training_loader,
-    open_folders,
-    read_or_next,
-)
-from l3r.data.source import ShardFolder
+from l3r.data.loader import StepLoader, build_training_loader
+from l3r.data.source import ShardFolder, open_folders
+from l3r.data.steps import DeviceShare, read_or_another
 from l3r.errors import DataError
 from l3r.types import Views
 
@@ -53,7 +48,7 @@ class ShardData(L.LightningDataModule):
             return []
         size = self.config.model.image_size
         dataset = ValidationGraphs(
-            open_folders(data.validation, data.num_views),
+            open_folders(data.validation, data),
             (size[0], size[1]),
             self.config.train.validation_graphs,
         )
@@ -81,10 +76,10 @@ class ValidationGraphs(Dataset[Views]):
         return len(self.graphs)
 
     def __getitem__(self, index: int) -> Views:
-        """Read one graph, a batch of one; the next stands in for an unreadable one."""
+        """Read one graph, a batch of one; another stands in for an unreadable one."""
         folder, graph = self.graphs[index]
         skipped: list[str] = []
-        views = read_or_next(folder, graph, self.image_size, skipped)
+        views = read_or_another(folder, graph, self.image_size, skipped)
         for line in skipped:
             log.warning("validation sample skipped: %s", line)
         if views is None:

@@ -7,16 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from l3r.config import DataConfig, SourceConfig
-from l3r.data.loader import (
-    DeviceShare,
-    build_training_loader,
-    open_folders,
-    read_graph,
-    read_or_next,
-)
+from l3r.data.loader import SkipGuard, build_training_loader
 from l3r.data.sampling import SampleChooser
 from l3r.data.schema import index_path
-from l3r.data.source import ShardFolder
+from l3r.data.source import ShardFolder, open_folders
+from l3r.data.steps import DeviceShare, read_graph, read_or_another
 from l3r.errors import ConfigError, DataError
 from tests.data.graphs import make_graph, make_mixed_graph, write_folder
 
@@ -132,7 +127,7 @@ def test_graphs_of_portrait_and_landscape_images_load(tmp_path):
 def test_shards_without_an_index_are_scanned(tmp_path):
     folder = write_folder(tmp_path, [make_graph(n, height=16, width=16) for n in range(2)])
     assert not index_path(folder / "hand-000000.tar").exists()
-    assert [len(f) for f in open_folders({"x": SourceConfig(shards=str(folder))}, 3)] == [2]
+    assert [len(f) for f in open_folders(config(folder).sources, config(folder))] == [2]
 
 
 def spoil(folder, number):
@@ -161,8 +156,8 @@ def test_a_sample_that_cannot_be_cropped_is_skipped_too(tmp_path):
     graphs[3].K[:, 0, 2] = 900.0
     folder = ShardFolder(write_folder(tmp_path, graphs), 3)
     skipped = []
-    views = read_or_next(folder, 3, (16, 16), skipped)
-    assert views.key[0].endswith("hand-000004")
+    views = read_or_another(folder, 3, (16, 16), skipped)
+    assert not views.key[0].endswith("hand-000003")
     assert len(skipped) == 1
     assert "principal point" in skipped[0]
 
@@ -176,12 +171,75 @@ def test_a_span_takes_a_share_of_the_graphs_and_its_complement_the_rest(shards):
         SourceConfig(shards="x", span=[0.5, 0.5])
 
 
+class Unreadable(ShardFolder):
+    """Writes down what it is asked for."""
+
+    def __init__(self, total, asked):
+        self.total, self.asked = total, asked
+
+    def __len__(self):
+        return self.total
+
+    def key(self, index):
+        return str(index)
+
+    def read(self, index):
+        self.asked.append(index)
+        raise DataError("gone")
+
+
+@given(st.integers(1, 400), st.data())
+def test_what_stands_in_for_an_unreadable_graph_lies_elsewhere(total, data):
+    """Twenty different graphs are tried, no two in a row of one shard of a tenth of them."""
+    first, asked = data.draw(st.integers(0, total - 1)), []
+    assert read_or_another(Unreadable(total, asked), first, (16, 16), []) is None
+    assert asked[0] == first
+    assert len(set(asked)) == len(asked) == min(total, 20)
+    if total >= 20:
+        assert all(abs(a - b) > total / 10 for a, b in itertools.pairwise(asked))
+
+
 def test_too_many_unreadable_samples_stop_the_run(tmp_path):
     folder = write_folder(tmp_path, [make_graph(n, height=16, width=16) for n in range(10)])
     for number in range(0, 10, 2):
         spoil(folder, number)
-    with pytest.raises(DataError, match=r"max_skip_rate=0.01.*l3r-prep check"):
+    with pytest.raises(DataError, match=r"max_skip_rate=0.01.*last: .*l3r-prep check"):
         keys(loader(config(folder), num_steps=200))
+
+
+@pytest.mark.parametrize(("max_rate", "borne"), [(0.0, 0), (0.01, 10), (0.0005, 0), (1.0, 3000)])
+def test_the_share_of_the_last_thousand_samples_is_bounded(max_rate, borne):
+    guard = SkipGuard(max_rate)
+    guard.count(100_000, [])  # what went well long ago excuses nothing
+    for _ in range(borne):
+        guard.count(0, ["bad"])
+    if max_rate < 1:
+        with pytest.raises(DataError, match="cannot be read"):
+            guard.count(1, ["one too many"])
+
+
+def test_unreadable_samples_far_apart_are_borne(caplog):
+    guard = SkipGuard(0.01)
+    with caplog.at_level(logging.WARNING):
+        for number in range(250):
+            guard.count(100, [f"bad {number}"])
+    said = [record.getMessage().rpartition(" ")[2] for record in caplog.records]
+    assert said == ["0", "99", "199"]  # the first and each hundredth
+
+
+def test_a_shard_deleted_during_a_run_costs_its_samples_and_no_more(tmp_path, caplog):
+    folder = write_folder(tmp_path, [make_graph(n, height=16, width=16) for n in range(40)])
+    strict = iter(loader(config(folder, max_skip_rate=0.001), num_steps=30))
+    batches = iter(loader(config(folder, max_skip_rate=0.5), num_steps=30))
+    next(strict), next(batches)
+    (folder / "hand-000003.tar").unlink()
+    with caplog.at_level(logging.WARNING):
+        drawn = list(itertools.chain.from_iterable(keys(batches)))
+    assert len(drawn) == 29 * 4
+    assert not any("hand-000003.tar" in key for key in drawn)
+    assert "hand-000003.tar:hand-0000" in caplog.text
+    with pytest.raises(DataError, match=r"last: .*hand-000003\.tar:hand-0000"):
+        keys(strict)
 
 
 def test_nothing_readable_stops_at_once(tmp_path):
@@ -198,10 +256,30 @@ def test_nothing_readable_stops_at_once(tmp_path):
 def test_requests_that_cannot_be_met_say_what_to_do(shards, tmp_path):
     with pytest.raises(ConfigError, match=r"data\.sources is empty"):
         loader(config())
-    with pytest.raises(ConfigError, match="multiple of the 3 devices"):
+    with pytest.raises(ConfigError, match="multiple of 3: 3 devices"):
         loader(config(shards), world_size=3)
     with pytest.raises(DataError, match=r"manifest\.json: no such file"):
         loader(config(tmp_path))
     small = write_folder(tmp_path / "small", [make_graph(0, num_views=2, height=16, width=16)])
     with pytest.raises(DataError, match="no graph of 3 images"):
         loader(config(small))
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"cache_gb": 1.0}, "cache_gb: no data.cache_dir"),
+        ({"cache_dir": "CACHE"}, "cache_dir: data.cache_gb is 0"),
+        ({"cache_dir": "CACHE", "cache_gb": 1.0}, "cache_dir: no source is an http"),
+        ({"prefetch_factor": 4}, "prefetch_factor: data.num_workers is 0"),
+        ({}, ""),
+    ],
+)
+def test_settings_without_effect_are_named(shards, tmp_path, monkeypatch, caplog, settings, words):
+    monkeypatch.chdir(tmp_path)
+    with caplog.at_level(logging.WARNING):
+        loader(config(shards, **settings))
+        loader(config(shards, **settings), rank=1, world_size=2)  # once, not on each device
+    found = [record.getMessage() for record in caplog.records]
+    assert len(found) == bool(words)
+    assert all(f"no effect of data.{words}" in line for line in found)

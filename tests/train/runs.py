@@ -17,6 +17,7 @@ TINY = [
     "data.num_views=3",
     "data.graphs_per_step=2",
     "data.num_workers=0",
+    "data.color_jitter=[0,0,0,0]",
     "train.accelerator=cpu",
     "train.lr=1e-2",
     "train.log_every=1",

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from l3r.config import InferenceConfig, load_config
-from l3r.data.loader import read_graph
 from l3r.data.source import ShardFolder
+from l3r.data.steps import read_graph
 from l3r.inference.checkpoint import load_model
 from l3r.inference.reconstruct import reconstruct_views
 from l3r.train.run import train

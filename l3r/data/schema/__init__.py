@@ -19,14 +19,17 @@ from l3r.data.schema.index import (
     index_shard,
     load_index,
     members_from_bytes,
+    parse_index,
     read_index,
     read_members,
+    read_range,
     write_index,
 )
 from l3r.data.schema.manifest import (
     MANIFEST_NAME,
     Manifest,
     ShardEntry,
+    parse_manifest,
     read_manifest,
     write_manifest,
 )
@@ -46,9 +49,12 @@ __all__ = [
     "index_shard",
     "load_index",
     "members_from_bytes",
+    "parse_index",
+    "parse_manifest",
     "read_index",
     "read_manifest",
     "read_members",
+    "read_range",
     "write_index",
     "write_manifest",
 ]

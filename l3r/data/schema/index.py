@@ -16,7 +16,7 @@ _BLOCK = 512
 _IMAGE = re.compile(r"\d\d\.jpg")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, slots=True)
 class IndexEntry:
     """One graph: a contiguous range of whole tar records."""
 
@@ -59,19 +59,36 @@ def read_index(shard: Path) -> ShardIndex:
     """
     path = index_path(shard)
     try:
-        plain = json.loads(path.read_bytes())
-        if plain["schema_version"] != SCHEMA_VERSION:
-            raise ValueError(f"schema version {plain['schema_version']}")
-        graphs = [IndexEntry(**entry) for entry in plain["graphs"]]
-        index = ShardIndex(tar_bytes=int(plain["tar_bytes"]), graphs=graphs)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        data = path.read_bytes()
+    except OSError as error:
         raise DataError(f"{path}: no index ({error}); delete it, it is made again") from error
+    index = parse_index(data, str(path))
     if not shard.is_file() or shard.stat().st_size != index.tar_bytes:
         raise DataError(
             f"{path}: made of a tar of {index.tar_bytes} bytes, {shard.name} is missing or another;"
             " delete the index, it is made again"
         )
     return index
+
+
+def parse_index(data: bytes, where: str) -> ShardIndex:
+    """Read an index from the bytes of its file.
+
+    Args:
+        data: The whole file.
+        where: Its path or address, for the message.
+
+    Raises:
+        DataError: It is malformed or of another version.
+    """
+    try:
+        plain = json.loads(data)
+        if plain["schema_version"] != SCHEMA_VERSION:
+            raise ValueError(f"schema version {plain['schema_version']}")
+        graphs = [IndexEntry(**entry) for entry in plain["graphs"]]
+        return ShardIndex(tar_bytes=int(plain["tar_bytes"]), graphs=graphs)
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{where}: no index ({error}); delete it, it is made again") from error
 
 
 def load_index(shard: Path) -> ShardIndex:
@@ -157,6 +174,15 @@ def read_members(shard: Path, entry: IndexEntry) -> dict[str, Any]:
     Raises:
         DataError: The range cannot be read or is not what the index says.
     """
+    return members_from_bytes(read_range(shard, entry), f"{shard.name}:{entry.key}")
+
+
+def read_range(shard: Path, entry: IndexEntry) -> bytes:
+    """Read the bytes of one graph from its tar.
+
+    Raises:
+        DataError: They cannot be read, or the tar ends before them.
+    """
     where = f"{shard.name}:{entry.key}"
     try:
         with shard.open("rb") as stream:
@@ -169,4 +195,4 @@ def read_members(shard: Path, entry: IndexEntry) -> dict[str, Any]:
             f"{where}: {len(data)} of {entry.size} bytes, the tar is cut off;"
             " rebuild it with l3r-prep"
         )
-    return members_from_bytes(data, where)
+    return data

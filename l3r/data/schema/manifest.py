@@ -77,17 +77,34 @@ def read_manifest(folder: Path) -> Manifest:
             " 'l3r-prep build', or run that again if it was interrupted"
         )
     try:
-        plain = json.loads(path.read_bytes())
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: {error}; check the folder of shards") from error
+    return parse_manifest(data, str(path))
+
+
+def parse_manifest(data: bytes, where: str) -> Manifest:
+    """Read a manifest from the bytes of its file.
+
+    Args:
+        data: The whole file.
+        where: Its path or address, for the message.
+
+    Raises:
+        DataError: It is malformed or of another schema version.
+    """
+    try:
+        plain = json.loads(data)
         version = plain.pop("schema_version")
         if version == SCHEMA_VERSION:
             del plain["num_graphs"], plain["num_bytes"]
             shards = [ShardEntry(**entry) for entry in plain.pop("shards")]
             return Manifest(shards=shards, **plain)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(
-            f"{path}: no manifest ({error!r}); rebuild the shards with l3r-prep"
+            f"{where}: no manifest ({error!r}); rebuild the shards with l3r-prep"
         ) from error
     raise DataError(
-        f"{path}: schema version {version}, expected {SCHEMA_VERSION};"
+        f"{where}: schema version {version}, expected {SCHEMA_VERSION};"
         " rebuild the shards with l3r-prep of this version"
     )
