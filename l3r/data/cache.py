@@ -73,7 +73,7 @@ class GraphCache:
                     return
                 used = self._used(ledger)
                 if used + size > self.max_bytes:
-                    used = self._make_room(min(self.max_bytes - size, _KEPT * self.max_bytes))
+                    used = self._make_room(min(self.max_bytes - size, int(_KEPT * self.max_bytes)))
                 # Before the file: a process that is killed in between leaves a sum too large.
                 _set(ledger, used + size)
                 _write_whole(path, data + _checksum(data))
@@ -102,7 +102,7 @@ class GraphCache:
         text = ledger.read(20)
         return int(text) if text.isdigit() else self._make_room(self.max_bytes)
 
-    def _make_room(self, limit: float) -> int:
+    def _make_room(self, limit: int) -> int:
         """Remove what was unused for longest until the rest is within a limit; give its size."""
         entries = []
         for path in self.folder.glob("??/*"):

@@ -3,7 +3,7 @@
 import time
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote, unquote
 from urllib.request import getproxies, proxy_bypass
 
 from urllib3 import BaseHTTPResponse, PoolManager, ProxyManager, Retry, Timeout
@@ -60,7 +60,7 @@ class HttpStore(ShardStore):
                 f"{parts.scheme}://{parts.host}{parts.path or ''}: expected https://HOST/FOLDER"
                 " without user, signature or '#'; copy shards that need those to a disk"
             )
-        self.name = (parts.path or "").rpartition("/")[2] or parts.host
+        self.name = unquote((parts.path or "").rpartition("/")[2]) or parts.host
         self._pool: PoolManager | None = None
 
     def __getstate__(self) -> dict[str, Any]:
