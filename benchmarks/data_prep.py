@@ -5,20 +5,14 @@ The files are synthetic and as large as the genuine ones; ``benchmarks/raw_files
 
 import tempfile
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from functools import wraps
 from pathlib import Path
-from pkgutil import resolve_name
-from typing import Any
-from unittest.mock import patch
 
 import cv2
 import numpy as np
 import torch
 
 from benchmarks.raw_files import WRITERS
+from benchmarks.timing import stopwatch
 from data_prep.converters import read_scenes
 from data_prep.frames import reduce_frame
 from data_prep.problems import Problems
@@ -74,7 +68,7 @@ def _measure(name: str, root: Path) -> list[tuple[str, str]]:
     (scene,) = read_scenes(name, root, "all", problems=problems)
     scene = scene.take(range(min(MAX_FRAMES, len(scene.frames))))
     assert not problems.counts, problems.summary()
-    with _stopwatch() as spent:
+    with stopwatch(STAGES) as spent:
         start = time.perf_counter()
         for _ in range(ROUNDS):
             _store(scene)
@@ -115,33 +109,3 @@ def _store(scene: Scene) -> None:
         ),
     )
     encode_graph(sample, "benchmark")
-
-
-@contextmanager
-def _stopwatch() -> Iterator[Counter[str]]:
-    """Add up the seconds of each stage; what one stage calls of another counts for the outer."""
-    spent: Counter[str] = Counter()
-    under_way: list[str] = []
-
-    def timed(stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        @wraps(function)
-        def call(*args: Any, **kwargs: Any) -> Any:
-            if under_way:
-                return function(*args, **kwargs)
-            under_way.append(stage)
-            start = time.perf_counter()
-            try:
-                return function(*args, **kwargs)
-            finally:
-                spent[under_way.pop()] += time.perf_counter() - start
-
-        return call
-
-    with ExitStack() as stack:
-        for stage, names in STAGES.items():
-            for name in names:
-                owner, _, attribute = name.rpartition(".")
-                home = resolve_name(owner)
-                timer = timed(stage, getattr(home, attribute))
-                stack.enter_context(patch.object(home, attribute, timer))
-        yield spent

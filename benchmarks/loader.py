@@ -1,46 +1,179 @@
-"""Graphs per second per core that the loader delivers."""
+"""Graphs per second that the loader delivers from one core, and the stage that limits it.
 
+The images are views of a rendered room under a fractal texture and a little noise, since plain
+renderings compress better than photos: their JPEGs take about as many bytes as genuine ones (0.23
+to 0.52 bytes a pixel on five data sets, docs/data.md). Colours are jittered.
+"""
+
+import multiprocessing
+import os
+import tarfile
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from multiprocessing.connection import Connection
 from pathlib import Path
 
+import cv2
+import numpy as np
 import torch
 
+from benchmarks.timing import stopwatch
+from data_prep.converters.synthetic import intrinsics
+from data_prep.raycast import render
+from data_prep.room import build_room, draw_cameras
+from data_prep.shards import relative_to_first
 from l3r.config import DataConfig, SourceConfig
-from l3r.data.loader import DeviceShare, build_training_loader
+from l3r.data.loader import build_training_loader
+from l3r.data.schema import index_shard, write_index
+from l3r.data.steps import DeviceShare
 from tests.data.graphs import make_graph, write_folder
+from tests.data.range_server import serve
 
-STEPS, GRAPHS = 12, 4
+STEPS, GRAPHS, VIEWS = 12, 4, 8
+STORED = (480, 640)
+
+STAGES = {
+    "read": ["l3r.data.store.read_range", "l3r.data.http_store.HttpStore.read_graph"],
+    "untar": ["l3r.data.source.members_from_bytes"],
+    "JPEG decode": ["l3r.data.schema.codec._decode_image"],
+    "depth decode": ["l3r.data.schema.codec._decode_depth"],
+    "resize, crop": ["l3r.data.stages._fit_view"],
+    "jitter": ["l3r.data.stages.change_colors"],
+    "to tensors": ["l3r.data.steps.lay_out"],
+}
+"""What is timed as which stage; the rest is the plan, JSON and checks of cameras."""
 
 
 def run() -> list[tuple[str, str]]:
-    """Load graphs of 8 stored images in this process, one thread: one core."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+    """Load graphs of 8 images in this process, on one core.
+
+    Returns:
+        Names and values of what was measured.
+    """
     rows = []
-    for stored, target in (
-        ((480, 640), (384, 512)),
-        ((480, 640), (224, 224)),
-        ((48, 48), (48, 48)),
-    ):
-        with tempfile.TemporaryDirectory() as temporary:
-            graphs = [make_graph(n, 8, *stored) for n in range(8)]
-            folder = write_folder(Path(temporary), graphs)
-            config = DataConfig(
-                sources={"made": SourceConfig(shards=str(folder))},
-                graphs_per_step=GRAPHS,
-                num_workers=0,
-            )
-            loader = build_training_loader(
-                config, target, seed=0, num_steps=STEPS + 1, share=DeviceShare()
-            )
-            batches = iter(loader)
-            next(batches)
-            start = time.perf_counter()
-            for _ in batches:
-                pass
-            rate = STEPS * GRAPHS / (time.perf_counter() - start)
-        label = f"8 images stored at {stored[0]}x{stored[1]}, given at {target[0]}x{target[1]}"
-        rows.append((label, f"{rate:.1f} graphs/s"))
-    torch.set_num_threads(threads)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = _write_shards(Path(temporary))
+        pixels = GRAPHS * VIEWS * STORED[0] * STORED[1]
+        ratio = _bytes_of_images(folder) / pixels
+        rows.append((f"images stored at {STORED[0]}x{STORED[1]}", f"{ratio:.2f} bytes a pixel"))
+        with _server(folder) as url, _one_core():
+            rows += _measure("from disk, given at 384x512", str(folder), (384, 512), stages=True)
+            rows += _measure("the same without jitter", str(folder), (384, 512), jitter=False)
+            rows += _measure("from disk, given at 224x224", str(folder), (224, 224))
+            rows += _measure("over HTTP, given at 384x512", url, (384, 512), stages=True)
     return rows
+
+
+def _measure(
+    label: str, place: str, size: tuple[int, int], *, stages: bool = False, jitter: bool = True
+) -> list[tuple[str, str]]:
+    config = DataConfig(
+        sources={"made": SourceConfig(shards=place)}, graphs_per_step=GRAPHS, num_workers=0
+    )
+    if not jitter:
+        config = replace(config, color_jitter=[0.0, 0.0, 0.0, 0.0])
+    share = DeviceShare()
+    loader = build_training_loader(config, size, seed=0, num_steps=STEPS + 1, share=share)
+    batches = iter(loader)
+    next(batches)
+    with stopwatch(STAGES) as spent:
+        start = time.perf_counter()
+        for _ in batches:
+            pass
+        each = (time.perf_counter() - start) / (STEPS * GRAPHS)
+    rows = [(f"{label}, graphs of {VIEWS}", f"{1 / each:.1f} graphs/s")]
+    if stages:
+        seconds = {stage: spent[stage] / (STEPS * GRAPHS) for stage in STAGES}
+        seconds["rest"] = each - sum(seconds.values())
+        limit = max(seconds, key=seconds.__getitem__)
+        for stage, value in seconds.items():
+            note = "  <- limits" if stage == limit else ""
+            rows.append((f"    {stage}{note}", f"{1e3 * value:.1f} ms {value / each:>4.0%}"))
+    return rows
+
+
+def _write_shards(folder: Path) -> Path:
+    """Write graphs of the same rendered views in different orders, with their indices."""
+    room = build_room(0)
+    world_from_cam = draw_cameras(room, VIEWS, 0)
+    K = intrinsics(STORED)
+    rng = np.random.default_rng(0)
+    images, depths = [], []
+    for camera in world_from_cam:
+        image, depth = render(room, torch.from_numpy(K), camera[None], STORED)
+        images.append(_textured(image[0].numpy(), rng))
+        depths.append(depth[0].numpy())
+    graphs = []
+    for number in range(GRAPHS):
+        order = np.roll(np.arange(VIEWS), number)
+        cameras = world_from_cam.double().numpy()[order]
+        graphs.append(
+            replace(
+                make_graph(number, VIEWS, *STORED),
+                image=[images[view] for view in order],
+                depth=[depths[view] for view in order],
+                K=np.tile(K, (VIEWS, 1, 1)),
+                cam_from_world=relative_to_first(cameras),
+            )
+        )
+    written = write_folder(folder / "shards", graphs)
+    for tar in written.glob("*.tar"):
+        write_index(tar, index_shard(tar))
+    return written
+
+
+def _textured(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Multiply a rendering by a texture whose amplitude falls with frequency as photos' do."""
+    height, width = image.shape[:2]
+    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width))
+    frequency[0, 0] = np.inf
+    spectrum = np.fft.rfft2(rng.normal(size=(height, width))) / frequency
+    texture = np.fft.irfft2(spectrum, s=(height, width))
+    shaded = image * (1 + 0.1 * texture / texture.std())[..., None]
+    noisy = 255 * shaded + rng.normal(scale=0.5, size=image.shape)
+    return np.clip(noisy, 0, 255).astype(np.uint8)
+
+
+def _bytes_of_images(folder: Path) -> int:
+    """Sum of the sizes of all JPEGs."""
+    tars = [tarfile.open(tar) for tar in folder.glob("*.tar")]
+    return sum(m.size for tar in tars for m in tar.getmembers() if m.name.endswith(".jpg"))
+
+
+@contextmanager
+def _one_core() -> Iterator[None]:
+    """Keep this process to one core and one thread."""
+    threads = torch.get_num_threads(), cv2.getNumThreads()
+    cores = os.sched_getaffinity(0)
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    os.sched_setaffinity(0, {min(cores)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, cores)
+        torch.set_num_threads(threads[0])
+        cv2.setNumThreads(threads[1])
+
+
+@contextmanager
+def _server(folder: Path) -> Iterator[str]:
+    """Serve a folder from a process of its own, which may use another core."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_serve, args=(folder, theirs), daemon=True)
+    process.start()
+    try:
+        yield ours.recv()
+    finally:
+        process.terminate()
+        process.join()
+
+
+def _serve(folder: Path, connection: Connection) -> None:
+    with serve(folder) as running:
+        connection.send(running.url)
+        connection.recv()

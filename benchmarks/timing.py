@@ -1,8 +1,14 @@
-"""Repeated timings of a call."""
+"""Repeated timings of a call, and where its time goes."""
 
 import statistics
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import wraps
+from pkgutil import resolve_name
+from typing import Any
+from unittest.mock import patch
 
 import torch
 
@@ -23,6 +29,40 @@ def seconds(call: Callable[[], object], repeats: int = 5) -> tuple[float, float]
 def shown(times: tuple[float, float]) -> str:
     """Format as least / median."""
     return f"{times[0]:.3f} / {times[1]:.3f} s"
+
+
+@contextmanager
+def stopwatch(stages: Mapping[str, Sequence[str]]) -> Iterator[Counter[str]]:
+    """Add up the seconds of each stage; what one stage calls of another counts for the outer.
+
+    Args:
+        stages: Full names of the functions of each stage, where they are looked up.
+    """
+    spent: Counter[str] = Counter()
+    under_way: list[str] = []
+
+    def timed(stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(function)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            if under_way:
+                return function(*args, **kwargs)
+            under_way.append(stage)
+            start = time.perf_counter()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                spent[under_way.pop()] += time.perf_counter() - start
+
+        return call
+
+    with ExitStack() as stack:
+        for stage, names in stages.items():
+            for name in names:
+                owner, _, attribute = name.rpartition(".")
+                home = resolve_name(owner)
+                timer = timed(stage, getattr(home, attribute))
+                stack.enter_context(patch.object(home, attribute, timer))
+        yield spent
 
 
 def _wait() -> None:

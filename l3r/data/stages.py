@@ -80,50 +80,34 @@ def jitter_colors(
         yield replace(sample, graph=replace(sample.graph, image=images))
 
 
-def to_views(samples: Iterable[KeyedGraph]) -> Iterator[Views]:
-    """Turn each graph into a batch of one, its images laid out landscape.
+def lay_out(samples: Sequence[KeyedGraph]) -> Views:
+    """Make a batch of graphs, all images laid out landscape.
 
     Portrait images are transposed with their depth, and the first two rows of their ``K`` are
     swapped, so that all images of a shape stack; ``true_shape`` keeps the upright shapes. Cameras,
     and so points, are those of the upright images.
 
     Args:
-        samples: Graphs whose images have one shape but for orientation, see :func:`resize_crop`.
+        samples: One or more graphs of as many images, which have one shape but for orientation,
+            see :func:`resize_crop`.
     """
-    for sample in samples:
-        graph = sample.graph
-        depth = torch.from_numpy(np.stack([_landscape(z) for z in graph.depth]))
-        K = torch.from_numpy(graph.K)
-        true_shape = torch.tensor([pixels.shape[:2] for pixels in graph.image])
-        is_portrait = (true_shape[:, 0] > true_shape[:, 1])[:, None, None]
-        world_from_cam = np.linalg.inv(graph.cam_from_world)
-        yield Views(
-            image=_to_planes([_landscape(pixels) for pixels in graph.image])[None],
-            true_shape=true_shape[None],
-            K=torch.where(is_portrait, transpose_K(K), K).float()[None],
-            world_from_cam=torch.from_numpy(world_from_cam).float()[None],
-            depth=depth[None],
-            valid=(depth > 0)[None],
-            is_metric=torch.tensor([graph.is_metric]),
-            dataset=[graph.dataset],
-            scores=torch.from_numpy(graph.pairs.iou).float()[None],
-            key=[sample.key],
-        )
-
-
-def collate(batch: Sequence[Views]) -> Views:
-    """Join batches of one into a batch of many."""
+    graphs = [sample.graph for sample in samples]
+    true_shape = torch.tensor([graph.image_size for graph in graphs])
+    is_portrait = (true_shape[..., 0] > true_shape[..., 1])[..., None, None]
+    K = torch.from_numpy(np.stack([graph.K for graph in graphs]))
+    world_from_cam = np.linalg.inv(np.stack([graph.cam_from_world for graph in graphs]))
+    depth = torch.from_numpy(np.stack([[_landscape(z) for z in graph.depth] for graph in graphs]))
     return Views(
-        image=torch.cat([v.image for v in batch]),
-        true_shape=torch.cat([v.true_shape for v in batch]),
-        K=torch.cat([v.K for v in batch]),
-        world_from_cam=torch.cat([v.world_from_cam for v in batch]),
-        depth=torch.cat([v.depth for v in batch]),
-        valid=torch.cat([v.valid for v in batch]),
-        is_metric=torch.cat([v.is_metric for v in batch]),
-        dataset=[name for v in batch for name in v.dataset],
-        scores=torch.cat([v.scores for v in batch]),
-        key=[key for v in batch for key in v.key],
+        image=_to_planes([[_landscape(pixels) for pixels in graph.image] for graph in graphs]),
+        true_shape=true_shape,
+        K=torch.where(is_portrait, transpose_K(K), K).float(),
+        world_from_cam=torch.from_numpy(world_from_cam).float(),
+        depth=depth,
+        valid=depth > 0,
+        is_metric=torch.tensor([graph.is_metric for graph in graphs]),
+        dataset=[graph.dataset for graph in graphs],
+        scores=torch.from_numpy(np.stack([graph.pairs.iou for graph in graphs])).float(),
+        key=[sample.key for sample in samples],
     )
 
 
@@ -138,13 +122,17 @@ def _landscape(pixels: np.ndarray) -> np.ndarray:
     return pixels.swapaxes(0, 1) if pixels.shape[0] > pixels.shape[1] else pixels
 
 
-def _to_planes(images: Sequence[UInt8[np.ndarray, "h w 3"]]) -> Float32[torch.Tensor, "n 3 h w"]:
-    """Bytes to numbers in [0, 1]; plane by plane is three times as fast as all in one go."""
-    planes = torch.empty(len(images), 3, *images[0].shape[:2])
-    for target, image in zip(planes, images, strict=True):
-        for channel, plane in enumerate(cv2.split(image)):
-            torch.div(torch.from_numpy(plane), 255, out=target[channel])
-    return planes
+def _to_planes(
+    graphs: Sequence[Sequence[UInt8[np.ndarray, "h w 3"]]],
+) -> Float32[torch.Tensor, "b n 3 h w"]:
+    """Bytes to numbers in [0, 1], written once: memory is what this costs."""
+    height, width = graphs[0][0].shape[:2]
+    batch = torch.empty(len(graphs), len(graphs[0]), 3, height, width)
+    for graph, images in enumerate(graphs):
+        for view, image in enumerate(images):
+            for channel, plane in enumerate(cv2.split(image)):
+                torch.div(torch.from_numpy(plane), 255, out=batch[graph, view, channel])
+    return batch
 
 
 def _fit_view(

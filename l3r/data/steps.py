@@ -9,7 +9,7 @@ from torch.utils.data import Dataset
 from l3r.data.color import ColorChange
 from l3r.data.sampling import SampleChooser, Variation
 from l3r.data.source import ShardFolder
-from l3r.data.stages import collate, jitter_colors, resize_crop, to_views
+from l3r.data.stages import KeyedGraph, jitter_colors, lay_out, resize_crop
 from l3r.errors import DataError
 from l3r.types import Views
 
@@ -114,15 +114,15 @@ class StepDataset(Dataset[StepBatch]):
         """Read this device's graphs of a batch."""
         plan = self.describe(number)
         skipped: list[str] = []
-        graphs: list[Views] = []
+        graphs: list[KeyedGraph] = []
         for slot in plan.slots:
             folder = self.folders[slot.source]
-            views = read_or_another(folder, slot.graph, plan.image_size, skipped, slot.colors)
-            if views is None:
+            graph = read_or_another(folder, slot.graph, plan.image_size, skipped, slot.colors)
+            if graph is None:
                 # Not raised here: an error that leaves a worker arrives as a traceback.
                 return StepBatch(views=None, skipped=skipped)
-            graphs.append(views)
-        return StepBatch(views=collate(graphs), skipped=skipped)
+            graphs.append(graph)
+        return StepBatch(views=lay_out(graphs), skipped=skipped)
 
     def _describe_slot(self, step: int, slot: int) -> SlotPlan:
         source, graph = self.chooser.choose(step, slot)
@@ -142,8 +142,8 @@ def read_or_another(
     image_size: tuple[int, int],
     skipped: list[str],
     colors: Sequence[ColorChange] = (),
-) -> Views | None:
-    """Read a graph as a batch of one; others of its folder stand in for an unreadable one.
+) -> KeyedGraph | None:
+    """Read a graph for a batch; others of its folder stand in for an unreadable one.
 
     The others are far apart in the folder, since unreadable graphs come in whole shards. Which
     they are depends on ``index`` alone.
@@ -165,29 +165,32 @@ def read_or_another(
     for attempt in range(min(MAX_ATTEMPTS, total)):
         current = (index + attempt * stride) % total
         try:
-            return read_graph(folder, current, image_size, colors)
+            return _read_fitted(folder, current, image_size, colors)
         except DataError as error:
             skipped.append(f"{folder.key(current)}: {error}")
     return None
 
 
-def read_graph(
-    folder: ShardFolder,
-    index: int,
-    image_size: tuple[int, int],
-    colors: Sequence[ColorChange] = (),
-) -> Views:
-    """Read one graph as a batch of one.
+def read_graph(folder: ShardFolder, index: int, image_size: tuple[int, int]) -> Views:
+    """Read one graph as a batch of one, its colours as stored.
 
     Args:
         folder: Where it is.
         index: Which one.
         image_size: (height, width).
-        colors: Change of each image's colours; empty: none.
 
     Raises:
         DataError: The graph cannot be read.
     """
+    return lay_out([_read_fitted(folder, index, image_size)])
+
+
+def _read_fitted(
+    folder: ShardFolder,
+    index: int,
+    image_size: tuple[int, int],
+    colors: Sequence[ColorChange] = (),
+) -> KeyedGraph:
     fitted = resize_crop([folder.read(index)], image_size=image_size)
-    (views,) = to_views(jitter_colors(fitted, changes=colors))
-    return views
+    (graph,) = jitter_colors(fitted, changes=colors)
+    return graph

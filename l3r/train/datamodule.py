@@ -9,6 +9,7 @@ from torch.utils.data import DataLoader, Dataset
 from l3r.config import RunConfig
 from l3r.data.loader import StepLoader, build_training_loader
 from l3r.data.source import ShardFolder, open_folders
+from l3r.data.stages import lay_out
 from l3r.data.steps import DeviceShare, read_or_another
 from l3r.errors import DataError
 from l3r.types import Views
@@ -79,9 +80,9 @@ class ValidationGraphs(Dataset[Views]):
         """Read one graph, a batch of one; another stands in for an unreadable one."""
         folder, graph = self.graphs[index]
         skipped: list[str] = []
-        views = read_or_another(folder, graph, self.image_size, skipped)
+        sample = read_or_another(folder, graph, self.image_size, skipped)
         for line in skipped:
             log.warning("validation sample skipped: %s", line)
-        if views is None:
+        if sample is None:
             raise DataError(f"no validation graph can be read; last: {skipped[-1]}")
-        return views
+        return lay_out([sample])

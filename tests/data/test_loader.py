@@ -156,8 +156,8 @@ def test_a_sample_that_cannot_be_cropped_is_skipped_too(tmp_path):
     graphs[3].K[:, 0, 2] = 900.0
     folder = ShardFolder(write_folder(tmp_path, graphs), 3)
     skipped = []
-    views = read_or_another(folder, 3, (16, 16), skipped)
-    assert not views.key[0].endswith("hand-000003")
+    graph = read_or_another(folder, 3, (16, 16), skipped)
+    assert not graph.key.endswith("hand-000003")
     assert len(skipped) == 1
     assert "principal point" in skipped[0]
 
