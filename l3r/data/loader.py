@@ -99,14 +99,15 @@ class StepLoader:
         guard = SkipGuard(self.config.max_skip_rate)
         numbers = range(self.batch, self.num_batches)
         for batch in read_ahead(self.dataset, numbers, self.config, pin_memory=self.pin_memory):
-            if batch.views is None:
+            views = batch.unpack()
+            if views is None:
                 raise DataError(
                     f"{MAX_ATTEMPTS} graphs in a row cannot be read; last: {batch.skipped[-1]}; "
                     "check that the shards are there, and run 'l3r-prep check' on them"
                 )
-            guard.count(len(batch.views.key), batch.skipped)
+            guard.count(len(views.key), batch.skipped)
             self.batch += 1
-            yield batch.views
+            yield views
 
     def state_dict(self) -> dict[str, Any]:
         """Everything a resumed run needs; a step begun is begun again."""

@@ -6,6 +6,7 @@ and never edits its input, so that stages compose in any loader.
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -80,7 +81,21 @@ def jitter_colors(
         yield replace(sample, graph=replace(sample.graph, image=images))
 
 
-def lay_out(samples: Sequence[KeyedGraph]) -> Views:
+@dataclass(frozen=True, kw_only=True)
+class PackedViews:
+    """A batch as it travels between processes: :class:`Views` in two fifths of the memory."""
+
+    image: UInt8[torch.Tensor, "b n h w 3"]
+    """RGB as bytes."""
+    others: dict[str, Any]
+    """The other fields of ``Views`` but ``valid``, which follows from ``depth``."""
+
+    def unpack(self) -> Views:
+        """Make the batch that the model takes."""
+        return Views(image=_to_planes(self.image), valid=self.others["depth"] > 0, **self.others)
+
+
+def lay_out(samples: Sequence[KeyedGraph]) -> PackedViews:
     """Make a batch of graphs, all images laid out landscape.
 
     Portrait images are transposed with their depth, and the first two rows of their ``K`` are
@@ -96,19 +111,17 @@ def lay_out(samples: Sequence[KeyedGraph]) -> Views:
     is_portrait = (true_shape[..., 0] > true_shape[..., 1])[..., None, None]
     K = torch.from_numpy(np.stack([graph.K for graph in graphs]))
     world_from_cam = np.linalg.inv(np.stack([graph.cam_from_world for graph in graphs]))
-    depth = torch.from_numpy(np.stack([[_landscape(z) for z in graph.depth] for graph in graphs]))
-    return Views(
-        image=_to_planes([[_landscape(pixels) for pixels in graph.image] for graph in graphs]),
-        true_shape=true_shape,
-        K=torch.where(is_portrait, transpose_K(K), K).float(),
-        world_from_cam=torch.from_numpy(world_from_cam).float(),
-        depth=depth,
-        valid=depth > 0,
-        is_metric=torch.tensor([graph.is_metric for graph in graphs]),
-        dataset=[graph.dataset for graph in graphs],
-        scores=torch.from_numpy(np.stack([graph.pairs.iou for graph in graphs])).float(),
-        key=[sample.key for sample in samples],
-    )
+    others = {
+        "true_shape": true_shape,
+        "K": torch.where(is_portrait, transpose_K(K), K).float(),
+        "world_from_cam": torch.from_numpy(world_from_cam).float(),
+        "depth": _stack([graph.depth for graph in graphs]),
+        "is_metric": torch.tensor([graph.is_metric for graph in graphs]),
+        "dataset": [graph.dataset for graph in graphs],
+        "scores": torch.from_numpy(np.stack([graph.pairs.iou for graph in graphs])).float(),
+        "key": [sample.key for sample in samples],
+    }
+    return PackedViews(image=_stack([graph.image for graph in graphs]), others=others)
 
 
 def _oriented(image_size: tuple[int, int], image: np.ndarray) -> tuple[int, int]:
@@ -122,17 +135,19 @@ def _landscape(pixels: np.ndarray) -> np.ndarray:
     return pixels.swapaxes(0, 1) if pixels.shape[0] > pixels.shape[1] else pixels
 
 
-def _to_planes(
-    graphs: Sequence[Sequence[UInt8[np.ndarray, "h w 3"]]],
-) -> Float32[torch.Tensor, "b n 3 h w"]:
-    """Bytes to numbers in [0, 1], written once: memory is what this costs."""
-    height, width = graphs[0][0].shape[:2]
-    batch = torch.empty(len(graphs), len(graphs[0]), 3, height, width)
-    for graph, images in enumerate(graphs):
-        for view, image in enumerate(images):
-            for channel, plane in enumerate(cv2.split(image)):
-                torch.div(torch.from_numpy(plane), 255, out=batch[graph, view, channel])
-    return batch
+def _stack(graphs: Sequence[Sequence[np.ndarray]]) -> torch.Tensor:
+    stacked = [[_landscape(pixels) for pixels in images] for images in graphs]
+    return torch.from_numpy(np.array(stacked))
+
+
+def _to_planes(image: UInt8[torch.Tensor, "b n h w 3"]) -> Float32[torch.Tensor, "b n 3 h w"]:
+    """Bytes to numbers in [0, 1]; plane by plane is three times as fast as all in one go."""
+    b, n, height, width, _ = image.shape
+    planes = torch.empty(b, n, 3, height, width)
+    for pixels, target in zip(image.flatten(0, 1).numpy(), planes.flatten(0, 1), strict=True):
+        for channel, plane in enumerate(cv2.split(pixels)):
+            torch.div(torch.from_numpy(plane), 255, out=target[channel])
+    return planes
 
 
 def _fit_view(

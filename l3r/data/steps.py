@@ -9,7 +9,7 @@ from torch.utils.data import Dataset
 from l3r.data.color import ColorChange
 from l3r.data.sampling import SampleChooser, Variation
 from l3r.data.source import ShardFolder
-from l3r.data.stages import KeyedGraph, jitter_colors, lay_out, resize_crop
+from l3r.data.stages import KeyedGraph, PackedViews, jitter_colors, lay_out, resize_crop
 from l3r.errors import DataError
 from l3r.types import Views
 
@@ -67,15 +67,20 @@ class StepPlan:
 class StepBatch:
     """What a worker sends: the batch and what it had to leave out."""
 
-    views: Views | None
-    """The batch; None where no sample of a source could be read."""
+    views: PackedViews | Views | None
+    """The batch, packed until it has left the worker; None where no sample of a source could be
+    read."""
     skipped: list[str]
     """One line for each unreadable sample, which another of the same source replaced."""
 
+    def unpack(self) -> Views | None:
+        """Give the batch that the model takes."""
+        return self.views.unpack() if isinstance(self.views, PackedViews) else self.views
+
     def pin_memory(self) -> "StepBatch":
-        """Pin the batch's tensors."""
-        pinned = None if self.views is None else self.views.pin_memory()
-        return StepBatch(views=pinned, skipped=self.skipped)
+        """Unpack the batch and pin its tensors, in torch's thread for that."""
+        views = self.unpack()
+        return StepBatch(views=views and views.pin_memory(), skipped=self.skipped)
 
 
 class StepDataset(Dataset[StepBatch]):
@@ -182,7 +187,7 @@ def read_graph(folder: ShardFolder, index: int, image_size: tuple[int, int]) -> 
     Raises:
         DataError: The graph cannot be read.
     """
-    return lay_out([_read_fitted(folder, index, image_size)])
+    return lay_out([_read_fitted(folder, index, image_size)]).unpack()
 
 
 def _read_fitted(

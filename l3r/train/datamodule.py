@@ -85,4 +85,4 @@ class ValidationGraphs(Dataset[Views]):
             log.warning("validation sample skipped: %s", line)
         if sample is None:
             raise DataError(f"no validation graph can be read; last: {skipped[-1]}")
-        return lay_out([sample])
+        return lay_out([sample]).unpack()

@@ -40,5 +40,5 @@ class Described(Dataset):
 
     def __getitem__(self, number):
         plans = [part.describe(number) for part in self.parts]
-        batches = [part[number].views for part in self.parts] if number < self.num_read else []
+        batches = [part[number].unpack() for part in self.parts] if number < self.num_read else []
         return plans, batches

@@ -37,7 +37,7 @@ def test_points_stay_where_they_are(height, width, share_x, share_y, size):
     """After any crop, scale and transposition, K and depth still lift pixels onto one plane."""
     graph = plane_graph(height, width, (share_x * width, share_y * height))
     (sample,) = resize_crop([keyed(graph)], image_size=size)
-    views = lay_out([sample])
+    views = lay_out([sample]).unpack()
     assert views.image.shape == (1, 1, 3, *size)
     points = unproject(views.depth[0, 0].double(), views.K[0, 0].double())
     error = (points[:, 2] - (2 + 0.1 * points[:, 0])).abs()
@@ -57,7 +57,7 @@ def test_the_layout_moves_pixels_and_leaves_points(height, width, share_x, share
     """Points of what is laid out are those of the upright image; portrait ones swap pixel axes."""
     graph = plane_graph(height, width, (share_x * width, share_y * height))
     (sample,) = resize_crop([keyed(graph)], image_size=size)
-    views = lay_out([sample])
+    views = lay_out([sample]).unpack()
     upright = sample.graph.depth[0].shape
     assert upright == (size[::-1] if height > width else size)
     assert views.true_shape.tolist() == [[list(upright)]]
@@ -103,7 +103,7 @@ def test_stages_do_not_edit_their_input():
 def test_views_carry_everything_in_the_documented_form():
     graph = make_graph(number=3, num_views=4)
     graph.depth[1][:5] = 0
-    views = lay_out([keyed(graph)])
+    views = lay_out([keyed(graph)]).unpack()
     assert 0 <= float(views.image.min()) <= float(views.image.max()) <= 1
     assert views.true_shape.tolist() == [[[48, 64]] * 4]
     assert views.valid[0, 1, :5].any() == False  # noqa: E712
@@ -111,7 +111,7 @@ def test_views_carry_everything_in_the_documented_form():
     eye = torch.eye(4).expand(4, 4, 4)
     product = views.world_from_cam[0] @ torch.from_numpy(graph.cam_from_world).float()
     torch.testing.assert_close(product, eye, atol=1e-6, rtol=0)
-    both = lay_out([keyed(graph), keyed(graph)])
+    both = lay_out([keyed(graph), keyed(graph)]).unpack()
     assert both.image.shape[0] == len(both.key) == 2
     assert both.key == ["shard:key"] * 2
 
@@ -120,7 +120,7 @@ def test_portrait_and_landscape_images_stack_in_one_batch():
     mixed = make_mixed_graph(portrait=(False, True, True, False))
     samples = [keyed(mixed), keyed(make_graph(num_views=4)), keyed(mixed)]
     for size in ((48, 64), (16, 32)):
-        views = lay_out(list(resize_crop(samples, image_size=size)))
+        views = lay_out(list(resize_crop(samples, image_size=size))).unpack()
         assert views.image.shape == (3, 4, 3, *size)
         assert views.depth.shape == views.valid.shape == (3, 4, *size)
         landscape, portrait = list(size), list(size)[::-1]
@@ -139,7 +139,7 @@ def test_portrait_and_landscape_images_stack_in_one_batch():
 def test_a_square_target_transposes_nothing():
     graph = make_mixed_graph(portrait=(False, True))
     (sample,) = resize_crop([keyed(graph)], image_size=(32, 32))
-    views = lay_out([sample])
+    views = lay_out([sample]).unpack()
     assert views.true_shape.tolist() == [[[32, 32]] * 2]
     assert torch.equal(views.K[0], torch.from_numpy(sample.graph.K).float())
     for view, pixels in enumerate(sample.graph.image):
@@ -153,7 +153,7 @@ def test_a_principal_point_outside_the_image_names_the_image():
 
 
 def test_a_batch_moves_to_a_device_but_for_its_true_shapes():
-    views = lay_out([keyed(make_graph(num_views=2))])
+    views = lay_out([keyed(make_graph(num_views=2))]).unpack()
     moved = views.to("meta")
     assert moved.true_shape.device.type == "cpu"
     assert torch.equal(moved.true_shape, views.true_shape)

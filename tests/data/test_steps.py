@@ -153,11 +153,11 @@ def test_colours_depend_on_seed_step_slot_and_view_and_on_nothing_else():
 def test_colours_never_come_from_the_global_generators(folders):
     (dataset,) = datasets(data_config(*folders), [DeviceShare()])
     state = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
-    first = dataset[0].views.image
+    first = dataset[0].unpack().image
     assert torch.equal(torch.get_rng_state(), state[0])
     assert np.array_equal(np.random.get_state()[1], state[1])  # noqa: NPY002
     torch.manual_seed(99)
-    assert torch.equal(dataset[0].views.image, first)
+    assert torch.equal(dataset[0].unpack().image, first)
 
 
 def test_without_jitter_images_are_those_stored(folders):
@@ -165,7 +165,7 @@ def test_without_jitter_images_are_those_stored(folders):
     (plain,), (jittered,) = (
         datasets(config, [DeviceShare()]) for config in (still, data_config(*folders))
     )
-    one, two = plain[0].views, jittered[0].views
+    one, two = plain[0].unpack(), jittered[0].unpack()
     assert one.key == two.key
     assert torch.equal(one.depth, two.depth)
     changed = (one.image != two.image).flatten(2).any(-1)

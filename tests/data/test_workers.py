@@ -53,10 +53,11 @@ def test_a_batch_is_pinned_tensor_by_tensor(folder, monkeypatch):
 
     monkeypatch.setattr(torch.Tensor, "pin_memory", pin)
     (dataset,) = datasets(data_config(folder), [DeviceShare()])
-    batch = dataset[0]
+    batch, unpacked = dataset[0], dataset[0].unpack()
+    monkeypatch.setattr(type(batch.views), "unpack", lambda packed: unpacked)
     found = torch.utils.data._utils.pin_memory.pin_memory(batch)
     assert isinstance(found, StepBatch)
-    views = batch.views
+    views = unpacked
     tensors = (views.image, views.depth, views.K, views.world_from_cam, views.valid, views.scores)
     assert {tensor.data_ptr() for tensor in tensors} <= set(pinned)
     assert torch.equal(found.views.image, views.image)
