@@ -143,7 +143,7 @@ class HttpStore(ShardStore):
             _check(response, where, hint, span)
             data = response.read()
         except BaseException:
-            response.close()  # what is left of the answer must not meet the next request
+            response.close()  # what is left of the answer is not wanted
             raise
         response.release_conn()
         return data
