@@ -98,7 +98,7 @@ def _lots(i: Int64[np.ndarray, " m"], j: Int64[np.ndarray, " m"]) -> UInt64[np.n
     x = x * np.uint64(0x9E3779B97F4A7C15)
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         x = (x ^ (x >> np.uint64(shift))) * np.uint64(factor)
-    return x ^ (x >> np.uint64(31))
+    return np.asarray(x ^ (x >> np.uint64(31)))
 
 
 def _rank(
