@@ -21,6 +21,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from data_prep.commands.graph_options import add_graph_arguments, graph_counts
 from data_prep.commands.room_options import ROOM_DEFAULTS, add_room_arguments, room_request
 from data_prep.converters import CONVERTERS
 from data_prep.problems import Problems
@@ -45,17 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder of the raw data; for synthetic it is rendered there where absent",
     )
     add("--out", type=Path, required=True, metavar="DIR", help="folder to write to")
-    add("--num-graphs", type=int, default=1000, metavar="N", help="most graphs a scene (1000)")
-    add(
-        "--graphs-per-image",
-        type=float,
-        default=1.0,
-        metavar="X",
-        help="most graphs of a scene for each of its images (1)",
-    )
+    add_graph_arguments(parser)
+    add("--max-uses", type=int, metavar="N", help="most graphs an image stands in")
     add("--graphs-per-shard", type=int, default=128, metavar="N", help="graphs of each tar (128)")
-    add("--max-views", type=int, default=10, metavar="N", help="most images of a graph (10)")
-    add("--min-views", type=int, metavar="N", help="fewest images of a graph (8, or --max-views)")
     add("--seed", type=int, default=0, metavar="N", help="seed of the draw (0)")
     add("--workers", type=int, default=0, metavar="N", help="processes that work (0: this one)")
     add("--tasks", type=int, default=1, metavar="K", help="tasks that share the work (1)")
@@ -190,13 +183,15 @@ def _build(
     from data_prep.ledger import PROBLEMS
     from data_prep.units import BuildRequest, TaskShare
 
-    min_views = min(8, args.max_views) if args.min_views is None else args.min_views
+    counts = graph_counts(args)
     request = BuildRequest(
         num_graphs=num_graphs,
-        graphs_per_image=args.graphs_per_image,
+        graphs_per_image=counts.graphs_per_image,
         graphs_per_shard=args.graphs_per_shard,
         seed=args.seed,
-        sampling=SamplingOptions(min_views=min_views, max_views=args.max_views),
+        sampling=SamplingOptions(
+            min_views=counts.min_views, max_views=counts.max_views, max_uses=args.max_uses
+        ),
         source=recorded,
     )
     with show_progress() as report:

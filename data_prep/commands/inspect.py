@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from data_prep.commands.graph_options import GraphCounts, add_graph_arguments, graph_counts
 from data_prep.converters import CONVERTERS, survey_scenes
 from data_prep.stored_size import reduced_size
 from data_prep.survey import SceneSurvey, quota
@@ -37,32 +38,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("dataset", choices=sorted(CONVERTERS), help="layout of the source")
     add("--raw", type=Path, required=True, metavar="DIR", help="folder of the raw data")
-    add("--num-graphs", type=int, default=1000, metavar="N", help="most graphs a scene (1000)")
-    add(
-        "--graphs-per-image",
-        type=float,
-        default=1.0,
-        metavar="X",
-        help="most graphs of a scene for each of its images (1)",
-    )
-    add("--max-views", type=int, default=10, metavar="N", help="most images of a graph (10)")
-    add("--min-views", type=int, metavar="N", help="fewest images of a graph (8, or --max-views)")
+    add_graph_arguments(parser)
     add("--rows", type=int, default=40, metavar="N", help="scenes to list (40; 0: all)")
     add("--json", action="store_true", help="print everything as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the table, or JSON."""
-    min_views = min(8, args.max_views) if args.min_views is None else args.min_views
-    if min(args.num_graphs, min_views, args.rows + 1) < 1:
-        raise DataError(
-            f"--num-graphs is {args.num_graphs}, --min-views {min_views} and --rows {args.rows},"
-            " expected 1 or more, and 0 or more rows"
-        )
-    rows = [
-        _Row.of(scene, args.num_graphs, args.graphs_per_image, args.max_views, min_views)
-        for scene in survey_scenes(args.dataset, args.raw)
-    ]
+    if args.rows < 0:
+        raise DataError(f"--rows is {args.rows}, expected 0 or more")
+    counts = graph_counts(args)
+    rows = [_Row.of(scene, counts) for scene in survey_scenes(args.dataset, args.raw)]
     if args.json:
         sys.stdout.write(json.dumps(_to_plain(args, rows), indent=2) + "\n")
     else:
@@ -81,24 +67,19 @@ class _Row:
     """Most that its shards take."""
 
     @classmethod
-    def of(
-        cls,
-        scene: SceneSurvey,
-        num_graphs: int,
-        graphs_per_image: float,
-        max_views: int,
-        min_views: int,
-    ) -> "_Row":
+    def of(cls, scene: SceneSurvey, counts: GraphCounts) -> "_Row":
         left_out = scene.excluded
-        if not left_out and scene.num_images < min_views:
-            left_out = f"fewer than {min_views} images"
+        if not left_out and scene.num_images < counts.min_views:
+            left_out = f"fewer than {counts.min_views} images"
         size = 0
         if not left_out and scene.image_size is not None:
             height, width = reduced_size(scene.image_size)
             # Each pair of images starts one graph at most.
             num_pairs = scene.num_images * (scene.num_images - 1) // 2
-            graphs = min(num_pairs, quota(scene.num_images, num_graphs, graphs_per_image))
-            views = min(max_views, scene.num_images)
+            graphs = min(
+                num_pairs, quota(scene.num_images, counts.num_graphs, counts.graphs_per_image)
+            )
+            views = min(counts.max_views, scene.num_images)
             size = round(graphs * views * height * width * (DEPTH_BYTES + JPEG_BYTES))
         return cls(scene=scene, left_out=left_out, max_bytes=size)
 
