@@ -252,8 +252,12 @@ def start(command, out, workers=2, **options):
     )
 
 
+LONG = ["--num-graphs", "250", "--graphs-per-image", "12"]
+"""Makes a build last for seconds after its first tar."""
+
+
 def test_workers_end_with_the_process_that_was_killed(command, tmp_path):
-    process = start(command, tmp_path / "out", stderr=subprocess.DEVNULL)
+    process = start([*command, *LONG], tmp_path / "out", stderr=subprocess.DEVNULL)
     wait_for_a_tar(tmp_path / "out")
     assert Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
     process.kill()
@@ -275,7 +279,7 @@ def test_a_full_disk_is_named_and_the_same_command_goes_on(command, tmp_path):
 
 
 def test_ctrl_c_ends_a_build_with_workers_in_one_line(command, tmp_path):
-    process = start(command, tmp_path / "out", stderr=subprocess.PIPE, text=True)
+    process = start([*command, *LONG], tmp_path / "out", stderr=subprocess.PIPE, text=True)
     wait_for_a_tar(tmp_path / "out")
     os.killpg(process.pid, signal.SIGINT)  # a terminal signals the workers too
     _, errors = process.communicate(timeout=60)

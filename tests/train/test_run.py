@@ -92,7 +92,7 @@ def wait_for_step(folder, step, process):
     raise TimeoutError
 
 
-@pytest.mark.parametrize("num_workers", [0, 2])
+@pytest.mark.parametrize("num_workers", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_killed_run_goes_on_as_if_it_had_never_stopped(
     hand_shards, finished, tmp_path, num_workers
 ):
