@@ -147,15 +147,19 @@ class _Run:
                 if scene.name in self.users and scene.name not in self.seen:
                     self._take(scene)
                     self._collect(self.at_once - 1)
-            for name in [*self.users]:
-                if name not in self.seen:
-                    self._miss(name)
+            missing = [name for name in self.users if name not in self.seen]
+            lost = [name for name in missing if not self._miss(name)]
             self._collect(0)
         except BrokenProcessPool as error:
             raise DataError(
                 f"{self.ledger.out}: a worker was killed, most often for want of memory; run the"
                 " same command again with fewer --workers"
             ) from error
+        if lost:
+            raise DataError(
+                f"{self.ledger.out}: {lost[0]} has graphs to be written and cannot be read any more"
+                f" ({len(lost)} such scenes); restore the source and run the same command again"
+            )
 
     def _take(self, scene: Scene) -> None:
         self.seen.add(scene.name)
@@ -173,12 +177,14 @@ class _Run:
 
         self.work[future] = done
 
-    def _miss(self, name: str) -> None:
-        """Record a scene of which nothing could be read."""
-        self.seen.add(name)
+    def _miss(self, name: str) -> bool:
+        """Record a scene of which nothing could be read; False where it could be, before."""
         counts = self.problems.by_scene.get(name) or {"missing_scene": 1}
         self.ledger.keep_plan(name, ScenePlan(problems=dict(counts)))
+        if self.ledger.graphs_of(name):
+            return False
         self._settle(name)
+        return True
 
     def _settle(self, name: str) -> None:
         """Make ready the units whose scenes are all planned now."""
@@ -236,11 +242,11 @@ def _plan(
 
 
 def _write(unit: Unit, scenes: dict[str, Scene], ledger: Ledger) -> ShardRecord:
-    parts = [
-        (scenes[part.scene], ledger.read_plan(part.scene).graphs[part.first : part.last])
-        for part in unit.parts
-        if part.scene in scenes
-    ]
+    parts = []
+    for part in unit.parts:
+        graphs = ledger.graphs_of(part.scene)[part.first : part.last]
+        if graphs:
+            parts.append((scenes[part.scene], graphs))
     return write_shard(ledger.out / unit.name, parts)
 
 
@@ -253,7 +259,8 @@ def _merge(build: _Build, dataset: str) -> Manifest | None:
         return None
     counts = Counter(build.listed.counts)
     for name in build.names:
-        counts.update(ledger.read_plan(name).problems)
+        plan = ledger.read_plan(name)
+        counts.update(plan.problems if plan else {})
     skipped = sum(len(record.skipped) for record in found)
     counts.update({"skipped_graph": skipped} if skipped else {})
     entries = [record.entry for record in found if record.entry.num_graphs]

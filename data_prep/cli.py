@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from l3r.errors import L3RError
+from l3r.files import explain_failure
 from l3r.version import __version__
 
 COMMANDS = {
@@ -43,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"l3r-prep {name}: {error}\n")
         return 2
     except OSError as error:
-        sys.stderr.write(f"l3r-prep {name}: {error}; check the path and its permissions\n")
+        sys.stderr.write(f"l3r-prep {name}: {explain_failure(error)}\n")
         return 2
     except KeyboardInterrupt:
         sys.stderr.write(f"l3r-prep {name}: interrupted; run it again to go on\n")

@@ -5,20 +5,24 @@ appears whole or not at all.
 """
 
 import json
+import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from data_prep.draw import GraphPlan
 from data_prep.plan import ScenePlan, fingerprint
 from data_prep.plan_file import read_plan, write_plan
 from data_prep.scene import Scene, slug_of
 from l3r.data.schema import MANIFEST_NAME, Manifest, ShardEntry, index_path, read_manifest
 from l3r.errors import DataError
-from l3r.files import write_atomic
+from l3r.files import write_atomic, write_first
 
 FOLDER = ".build"
 """Folder of the records, inside the folder of shards."""
+_DAY = 86_400.0
 PROBLEMS = "problems"
 """Key of the manifest's request that holds what was met, not what was asked."""
 
@@ -61,7 +65,7 @@ class Ledger:
                 f"{out}: holds tars and no record of a build, expected an empty folder; name"
                 " another --out"
             )
-        _write(path, request)
+        write_first(path, _encode(request))
 
     def _compare(self, old: dict[str, Any], new: dict[str, Any]) -> None:
         for key in sorted(old.keys() | new.keys()):
@@ -78,14 +82,14 @@ class Ledger:
             DataError: They are not those the build began with.
         """
         path = self.folder / "scenes.json"
-        old = _read(path)["names"] if path.is_file() else list(names)
+        write_first(path, _encode({"names": list(names)}))
+        old = _read(path)["names"]
         if old != list(names):
             changed = sorted(set(old) ^ set(names))[:1] or ["their order"]
             raise DataError(
                 f"{self.out}: begun with {len(old)} scenes, now there are {len(names)}"
                 f" ({changed[0]} differs); restore the source, or name another --out"
             )
-        _write(path, {"names": old})
 
     def find_manifest(self) -> Manifest | None:
         """Give the manifest of an earlier build, if there is one."""
@@ -119,38 +123,46 @@ class Ledger:
         _write(self.folder / f"{entry.name}.json", {**asdict(entry), "skipped": record.skipped})
 
     def has_plan(self, scene: Scene) -> bool:
-        """Whether a scene was planned.
+        """Whether a scene was planned; one that could not be read then stays left out.
 
         Raises:
             DataError: It was, with other frames or cameras.
         """
-        path = self._plan_path(scene.name)
-        if not path.is_file():
+        plan = self.read_plan(scene.name)
+        if plan is None:
             return False
-        if read_plan(path).fingerprint != fingerprint(scene):
+        if plan.fingerprint not in ("", fingerprint(scene)):
             raise DataError(
                 f"{self.out}: the frames or cameras of {scene.name} have changed since the build"
                 " began; restore the source, or name another --out"
             )
         return True
 
-    def read_plan(self, scene: str) -> ScenePlan:
-        """Give what was planned for a scene; nothing where it was not.
+    def read_plan(self, scene: str) -> ScenePlan | None:
+        """Give what was planned for a scene, None where it was not.
 
         Raises:
             DataError: The record is damaged.
         """
         path = self._plan_path(scene)
-        return read_plan(path) if path.is_file() else ScenePlan()
+        return read_plan(path) if path.is_file() else None
+
+    def graphs_of(self, scene: str) -> list[GraphPlan]:
+        """Give the graphs planned for a scene; none where it was not planned."""
+        plan = self.read_plan(scene)
+        return plan.graphs if plan else []
 
     def keep_plan(self, scene: str, plan: ScenePlan) -> None:
-        """Record what was planned for a scene."""
+        """Record what was planned for a scene, unless another task has done so."""
         write_plan(self._plan_path(scene), plan)
 
     def remove_remains(self) -> None:
-        """Remove what killed processes left among the records."""
+        """Remove what processes that were killed a day ago or more left among the records."""
         for path in self.folder.glob(".*.tmp"):
-            path.unlink(missing_ok=True)
+            # Younger ones may belong to a task that has just begun.
+            with suppress(FileNotFoundError):
+                if time.time() - path.stat().st_mtime > _DAY:
+                    path.unlink()
 
     def _plan_path(self, scene: str) -> Path:
         return self.folder / f"{slug_of(scene)}.plan.npz"
@@ -171,4 +183,8 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _write(path: Path, record: dict[str, Any]) -> None:
-    write_atomic(path, (json.dumps(record, indent=1) + "\n").encode())
+    write_atomic(path, _encode(record))
+
+
+def _encode(record: dict[str, Any]) -> bytes:
+    return (json.dumps(record, indent=1) + "\n").encode()

@@ -14,14 +14,17 @@ from data_prep.plan import ScenePlan
 from data_prep.problems import Problem
 from l3r.data.schema import PairTable
 from l3r.errors import DataError
-from l3r.files import write_atomic
+from l3r.files import write_first
 
 _DIGEST = 32
 _TABLES = [f.name for f in fields(PairTable)]
 
 
 def write_plan(path: Path, plan: ScenePlan) -> None:
-    """Write a plan, whole or not at all: a digest, then an npz of numbers and of text."""
+    """Write a plan unless there is one: a digest, then an npz of numbers and of text.
+
+    Tasks that plan the same scene at the same time then go by one plan, the first.
+    """
     most = max((len(graph.views) for graph in plan.graphs), default=0)
     views = np.full((len(plan.graphs), most), -1, dtype=np.int64)
     tables = np.zeros((len(_TABLES), len(plan.graphs), most, most))
@@ -40,7 +43,7 @@ def write_plan(path: Path, plan: ScenePlan) -> None:
     encoded = np.frombuffer(json.dumps(text).encode(), np.uint8)
     np.savez_compressed(stream, views=views, tables=tables, text=encoded)
     content = stream.getvalue()
-    write_atomic(path, hashlib.sha256(content).digest() + content)
+    write_first(path, hashlib.sha256(content).digest() + content)
 
 
 def read_plan(path: Path) -> ScenePlan:

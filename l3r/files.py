@@ -1,9 +1,10 @@
 """Files appear whole or not at all: write beside, flush to disk, rename."""
 
+import errno
 import os
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from glob import escape
 from pathlib import Path
 
@@ -30,6 +31,10 @@ def atomic_path(path: Path) -> Iterator[Path]:
         flush_to_disk(temporary)
         temporary.replace(path)
         flush_to_disk(path.parent)
+    except OSError as error:
+        # A disk that fills up in the middle of a write does not say of what.
+        error.filename = error.filename or str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -38,6 +43,29 @@ def write_atomic(path: Path, data: bytes | str) -> None:
     """Write a file as a whole; text becomes UTF-8 with the line ends as given."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(data.encode() if isinstance(data, str) else data)
+
+
+def write_first(path: Path, data: bytes) -> None:
+    """Write a file as a whole unless it is there: of several processes the first one wins."""
+    temporary = hidden_sibling(path)
+    try:
+        temporary.write_bytes(data)
+        flush_to_disk(temporary)
+        with suppress(FileExistsError):
+            os.link(temporary, path)
+        flush_to_disk(path.parent)
+    except OSError as error:
+        error.filename = error.filename or str(path)
+        raise
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def explain_failure(error: OSError) -> str:
+    """Say what failed on a disk and what to do, in one line."""
+    is_full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    hint = "free space, then run the same command again" if is_full else "check its permissions"
+    return f"{error.filename or 'a file'}: {error.strerror or error}; {hint}"
 
 
 def flush_to_disk(path: Path) -> None:

@@ -112,13 +112,57 @@ def test_scenes_that_came_or_went_since_the_build_began_are_refused(three_scenes
 
 
 def test_a_scene_that_was_named_and_cannot_be_read_is_counted(three_scenes, tmp_path):
-    class Silent(PartSource):
-        def read(self, names, problems):
-            return (scene for scene in super().read(names, problems) if scene.name != "s1")
-
-    manifest = build_shards(Silent(three_scenes, lambda scene: scene), tmp_path, BUILD)
+    manifest = build_shards(Without(three_scenes, whole), tmp_path, BUILD)
     assert manifest.request["problems"] == {"missing_scene": 1}
     assert manifest.num_graphs == 10
+
+
+class Without(PartSource):
+    """All scenes are named, one cannot be read."""
+
+    def read(self, names, problems):
+        return (scene for scene in super().read(names, problems) if scene.name != "s1")
+
+
+def whole(scene):
+    return scene
+
+
+def test_a_scene_that_was_planned_and_cannot_be_read_any_more_ends_the_build(
+    three_scenes, tmp_path
+):
+    straight, out = tmp_path / "straight", tmp_path / "out"
+    build_shards(three_scenes, straight, BUILD)
+    build_shards(three_scenes, out, BUILD, share=TaskShare(index=0, count=2))
+    spoilt = Without(three_scenes, whole)
+    for _ in range(2):
+        with pytest.raises(DataError, match=r"s1 has graphs to be written and cannot be read"):
+            build_shards(spoilt, out, BUILD, share=TaskShare(index=1, count=2))
+    build_shards(three_scenes, out, BUILD, share=TaskShare(index=1, count=2))
+    assert contents(out) == contents(straight)
+    # And in a finished folder that has lost a tar of it.
+    (out / "synthetic-000004.tar").unlink()
+    with pytest.raises(DataError, match="cannot be read any more"):
+        build_shards(spoilt, out, BUILD)
+    build_shards(three_scenes, out, BUILD)
+    assert contents(out) == contents(straight)
+
+
+def test_a_scene_that_could_not_be_read_by_one_task_is_left_out_by_all(three_scenes, tmp_path):
+    whole_build = build_shards(Without(three_scenes, whole), tmp_path / "one", BUILD)
+    out = tmp_path / "two"
+    spoilt = Without(three_scenes, whole)
+    assert build_shards(spoilt, out, BUILD, share=TaskShare(index=0, count=2)) is None
+    found = build_shards(three_scenes, out, BUILD, share=TaskShare(index=1, count=2))
+    assert found == whole_build
+    assert contents(out) == contents(tmp_path / "one")
+
+
+def test_of_two_plans_of_a_scene_the_first_is_kept(room_scene, tmp_path):
+    write_plan(tmp_path / "plan.npz", plan_scene(room_scene, BUILD))
+    before = (tmp_path / "plan.npz").read_bytes()
+    write_plan(tmp_path / "plan.npz", ScenePlan())
+    assert (tmp_path / "plan.npz").read_bytes() == before
 
 
 def test_a_shard_that_vanishes_while_others_are_written_is_named(three_scenes, tmp_path):
@@ -223,7 +267,7 @@ def test_killed_at_ten_random_moments_a_build_ends_with_the_same_bytes(command, 
     assert halted > MOMENTS // 2
     assert run(command, out).returncode == 0
     assert contents(out) == contents(tmp_path / "straight")
-    assert not [*out.rglob(".*.tmp")]
+    assert not [*out.glob(".*.tmp")]
 
 
 def wait_for_the_end_of(process):
@@ -271,7 +315,7 @@ def test_a_full_disk_is_named_and_the_same_command_goes_on(command, tmp_path):
     found = run(limited, tmp_path)
     assert found.returncode == 2
     (line,) = [line for line in found.stderr.splitlines() if line.startswith("l3r-prep build: ")]
-    assert "File too large" in line
+    assert "tartanair-000000.tar: File too large; free space, then run the same command" in line
     assert not [*tmp_path.glob("*.tar")]
     assert not [*tmp_path.glob(".*.tmp")]
     assert run(command, tmp_path).returncode == 0
