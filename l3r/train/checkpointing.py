@@ -75,8 +75,9 @@ def find_resume(checkpoint: Path, config: RunConfig) -> Path | None:
 def _is_free(key: str, config: RunConfig) -> bool:
     if key == "train.max_steps":
         return config.train.schedule == "constant"
-    # Shards may move, and inference is not trained.
-    return key in FREE_TO_CHANGE or key.endswith(".shards") or key.startswith("inference.")
+    # Shards may move; logs and inference change nothing that is learnt.
+    may_change = key.endswith(".shards") or key.startswith(("inference.", "logs."))
+    return key in FREE_TO_CHANGE or may_change
 
 
 def _flatten(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

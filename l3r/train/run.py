@@ -16,10 +16,11 @@ from l3r.inference.checkpoint import write_model
 from l3r.inference.weights import initialise
 from l3r.loss.joint import JointLoss
 from l3r.model.light3r import Light3R
-from l3r.train.callbacks import CsvLog, GradientGuard, StepProgress, StepTimer
+from l3r.train.callbacks import GradientGuard, RoomGradients, StepProgress, StepTimer
 from l3r.train.checkpointing import AtomicCheckpointIO, find_resume
 from l3r.train.datamodule import ShardData
 from l3r.train.module import TrainModule
+from l3r.train.run_log import RunLog
 
 
 def train(config: RunConfig) -> Path:
@@ -83,9 +84,10 @@ def _build_trainer(config: RunConfig, folder: Path) -> L.Trainer:
         gradient_clip_val=train.clip_norm,
         callbacks=[
             checkpoint,
+            RoomGradients(train.log_every),
             GradientGuard(folder / "bad_steps.jsonl", train.max_bad_steps),
             StepTimer(),
-            CsvLog(folder, train.log_every),
+            RunLog(folder, train.log_every),
             StepProgress(),
         ],
         plugins=[AtomicCheckpointIO()],

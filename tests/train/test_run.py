@@ -48,6 +48,14 @@ def test_a_run_leaves_its_log_its_configuration_and_its_weights(finished, hand_s
         "grad_norm",
         "graphs_per_second",
         "data_wait",
+        *(f"grad_norm_{room}" for room in ("encoder", "alignment", "decoder", "heads")),
+        "log_conf",
+        "confident",
+        "root_degree",
+        "root_degree_max",
+        "tree_depth",
+        "hand/loss",
+        "hand/pair_error",
     }
     assert set(rows[0]) == expected
     validation = read_log(finished, "validation.csv")
@@ -122,12 +130,16 @@ def test_a_run_may_move_with_its_shards(hand_shards, finished, tmp_path):
     assert losses(tmp_path / "b") == losses(finished)
 
 
-def test_a_log_of_other_columns_is_not_mixed(hand_shards, tmp_path):
+def test_a_run_of_an_older_version_goes_on_with_more_columns(hand_shards, tmp_path):
     train(load_config(layers(hand_shards, tmp_path, max_steps=5)))
     log = tmp_path / "metrics.csv"
     log.write_text(log.read_text().replace("pair_error", "old_error"))
-    with pytest.raises(LaunchError, match="move the file away"):
-        train(load_config(layers(hand_shards, tmp_path, max_steps=6)))
+    train(load_config(layers(hand_shards, tmp_path, max_steps=6)))
+    rows = read_log(tmp_path)
+    assert len(rows) == 6
+    assert rows[4]["old_error"]
+    assert rows[4]["pair_error"] == "" != rows[5]["pair_error"]
+    assert rows[5]["old_error"] == ""
 
 
 def test_a_gpu_that_is_not_there_is_a_clear_error(hand_shards, tmp_path, monkeypatch):

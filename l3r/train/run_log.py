@@ -1,0 +1,167 @@
+"""One row of figures now and then, for every place that keeps them."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+import torch.distributed as dist
+from jaxtyping import Float
+from lightning.pytorch.callbacks import Callback
+from torch import Tensor
+
+from l3r.train.csv_table import append_row, drop_rows_after
+from l3r.train.sinks import Sink
+from l3r.types import Views
+
+
+class DatasetMeans:
+    """Means of figures over the graphs of each data set, since they were last taken.
+
+    Adding does not wait for the device; taking does.
+    """
+
+    def __init__(self) -> None:
+        self._sums: dict[str, Tensor] = {}
+        self._counts: dict[str, int] = defaultdict(int)
+
+    def add(self, datasets: Sequence[str], figures: Mapping[str, Float[Tensor, " b"]]) -> None:
+        """Add the figures of a batch's graphs."""
+        # Picked apart on the host: an index on the device would have to be sent there.
+        for index, dataset in enumerate(datasets):
+            self._counts[dataset] += 1
+            for name, values in figures.items():
+                key = f"{dataset}/{name}"
+                value = values[index].detach()
+                self._sums[key] = self._sums[key] + value if key in self._sums else value
+
+    def take(self) -> dict[str, float]:
+        """Give the means over all devices, ``DATASET/FIGURE``, and start anew."""
+        own = {key: (float(sum_), self._count_of(key)) for key, sum_ in self._sums.items()}
+        self._sums.clear()
+        self._counts.clear()
+        totals: dict[str, list[float]] = {}
+        for part in gather(own):
+            for key, (sum_, count) in part.items():
+                total = totals.setdefault(key, [0.0, 0.0])
+                total[0], total[1] = total[0] + sum_, total[1] + count
+        return {key: sum_ / count for key, (sum_, count) in sorted(totals.items())}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Give what a checkpoint keeps, so that a resumed run's next row is the same."""
+        return {"sums": dict(self._sums), "counts": dict(self._counts)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Take up the state of a checkpoint."""
+        self._sums = dict(state["sums"])
+        self._counts = defaultdict(int, state["counts"])
+
+    def _count_of(self, key: str) -> int:
+        return self._counts[key.rsplit("/", 1)[0]]
+
+
+def gather(own: Any) -> list[Any]:
+    """Collect an object of builtins from every process; waits for all of them."""
+    if not (dist.is_available() and dist.is_initialized()):
+        return [own]
+    parts: list[Any] = [None] * dist.get_world_size()
+    dist.all_gather_object(parts, own)
+    return parts
+
+
+class RunLog(Callback):
+    """Writes ``metrics.csv`` (training), ``validation.csv`` and the sinks, one row a time.
+
+    A resumed run first drops the rows after its checkpoint, so that a file reads as if the run
+    had never stopped. Numbers leave the device on logged steps alone.
+
+    Args:
+        folder: The run's folder.
+        every: Steps between training rows.
+        sinks: Other places for the same rows.
+    """
+
+    def __init__(self, folder: Path, every: int, sinks: Sequence[Sink] = ()) -> None:
+        self.training = folder / "metrics.csv"
+        self.validation = folder / "validation.csv"
+        self.every = every
+        self.sinks = sinks
+        self.datasets = DatasetMeans()
+        self.written = -1
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Forget what a stopped run wrote after its checkpoint."""
+        self.written = trainer.global_step
+        if trainer.is_global_zero:
+            for path in (self.training, self.validation):
+                drop_rows_after(path, trainer.global_step)
+            for sink in self.sinks:
+                sink.start(trainer.global_step)
+
+    def on_train_batch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Views,
+        batch_idx: int,
+    ) -> None:
+        """Write a training row, once a step however many batches it has."""
+        self.datasets.add(batch.dataset, outputs["graphs"])
+        step = trainer.global_step
+        is_due = step % self.every == 0 or step == trainer.max_steps
+        if not is_due or step == self.written:
+            return
+        self.written = step
+        row = {"lr": float(trainer.optimizers[0].param_groups[0]["lr"])}
+        row |= _mean_over_processes(_numbers(trainer.callback_metrics, "train/"))
+        if torch.cuda.is_available():
+            row["gpu_gib"] = torch.cuda.max_memory_allocated() / 2**30
+        self._write(trainer, "train", row | self.datasets.take())
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Write a validation row."""
+        self._write(trainer, "val", _numbers(trainer.callback_metrics, "val/"))
+
+    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Flush the sinks."""
+        if trainer.is_global_zero:
+            for sink in self.sinks:
+                sink.close()
+
+    def on_exception(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException
+    ) -> None:
+        """Flush the sinks of a run that stops early."""
+        self.on_train_end(trainer, pl_module)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Give what a checkpoint keeps: sums since the last row."""
+        return self.datasets.state_dict()
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take up the sums of a checkpoint."""
+        self.datasets.load_state_dict(state_dict)
+
+    def _write(self, trainer: L.Trainer, kind: str, row: Mapping[str, float]) -> None:
+        if not trainer.is_global_zero:
+            return
+        step = trainer.global_step
+        path = self.training if kind == "train" else self.validation
+        append_row(path, {"step": float(step), **row})
+        for sink in self.sinks:
+            sink.write(step, {f"{kind}/{name}": value for name, value in row.items()})
+
+
+def _numbers(metrics: Mapping[str, Tensor], prefix: str) -> dict[str, float]:
+    chosen = {name: value for name, value in metrics.items() if name.startswith(prefix)}
+    # Those of single data sets, which have one more slash, come last.
+    names = sorted(chosen, key=lambda name: (name.count("/"), name))
+    return {name.removeprefix(prefix): float(chosen[name]) for name in names}
+
+
+def _mean_over_processes(row: Mapping[str, float]) -> dict[str, float]:
+    parts = gather(dict(row))
+    return {name: sum(part[name] for part in parts) / len(parts) for name in row}
