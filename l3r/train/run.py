@@ -21,6 +21,7 @@ from l3r.train.checkpointing import AtomicCheckpointIO, find_resume
 from l3r.train.datamodule import ShardData
 from l3r.train.module import TrainModule
 from l3r.train.run_log import RunLog
+from l3r.train.sinks import Sink, build_sinks
 
 
 def train(config: RunConfig) -> Path:
@@ -34,7 +35,8 @@ def train(config: RunConfig) -> Path:
 
     Raises:
         CheckpointError: ``init`` cannot be read or does not fit; nothing is written then.
-        ConfigError: No data, or ``output_dir`` holds another run.
+        ConfigError: No data, ``output_dir`` holds another run, or a package of ``logs.to`` is
+            missing.
         DataError: The shards cannot be read.
         LaunchError: Too many bad steps in a row.
     """
@@ -42,6 +44,7 @@ def train(config: RunConfig) -> Path:
         raise ConfigError("train.accelerator is gpu and torch finds none; use auto or cpu")
     folder = Path(config.train.output_dir)
     last = folder / "last.ckpt"
+    sinks = build_sinks(config, folder)
     resume_from = find_resume(last, config)
     torch.manual_seed(config.train.seed)
     model = Light3R(config.model, config.graph)
@@ -54,14 +57,14 @@ def train(config: RunConfig) -> Path:
         model.compile_blocks()
     module = TrainModule(config, model, JointLoss(config.loss))
     _quieten_lightning()
-    trainer = _build_trainer(config, folder)
+    trainer = _build_trainer(config, folder, sinks)
     trainer.fit(module, datamodule=ShardData(config), ckpt_path=resume_from, weights_only=True)
     trainer.save_checkpoint(last)
     write_model(folder / "model.ckpt", model, config)
     return folder / "model.ckpt"
 
 
-def _build_trainer(config: RunConfig, folder: Path) -> L.Trainer:
+def _build_trainer(config: RunConfig, folder: Path, sinks: list[Sink]) -> L.Trainer:
     train = config.train
     checkpoint = ModelCheckpoint(
         dirpath=folder,
@@ -87,7 +90,7 @@ def _build_trainer(config: RunConfig, folder: Path) -> L.Trainer:
             RoomGradients(train.log_every),
             GradientGuard(folder / "bad_steps.jsonl", train.max_bad_steps),
             StepTimer(),
-            RunLog(folder, train.log_every),
+            RunLog(folder, train.log_every, sinks),
             StepProgress(),
         ],
         plugins=[AtomicCheckpointIO()],

@@ -69,4 +69,4 @@ def test_a_batch_of_stars_and_chains_is_told_apart():
         chain[view, view + 1] = chain[view + 1, view] = 0.9
     both = torch.stack([chain, star(5)[1]])
     found = summarise_trees(build_tree(both, GraphConfig()))
-    assert found == {"root_degree": 3.0, "root_degree_max": 4.0, "tree_depth": 1.5}
+    assert found == {"root_degree": 3.0, "root_degree_max": 4.0, "tree_depth": 2.0}
