@@ -17,7 +17,8 @@ class LogsConfig:
     wandb_project: str = "light3r"
     """Project of Weights & Biases."""
     pictures: bool = True
-    """Draw the first validation graph at each validation: photos, depth, confidence."""
+    """Draw the first validation graph at each validation: photos, depth, confidence; in
+    ``pictures``."""
 
     def __post_init__(self) -> None:
         """Check values."""

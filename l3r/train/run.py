@@ -90,7 +90,7 @@ def _build_trainer(config: RunConfig, folder: Path, sinks: list[Sink]) -> L.Trai
             RoomGradients(train.log_every),
             GradientGuard(folder / "bad_steps.jsonl", train.max_bad_steps),
             StepTimer(),
-            RunLog(folder, train.log_every, sinks),
+            RunLog(folder, train.log_every, sinks, pictures=config.logs.pictures),
             StepProgress(),
         ],
         plugins=[AtomicCheckpointIO()],

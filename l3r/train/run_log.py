@@ -1,7 +1,11 @@
 """One row of figures now and then, for every place that keeps them."""
 
+import json
+import os
+import platform
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +16,12 @@ from jaxtyping import Float
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
+from l3r.export.graph_sheet import write_graph_sheet
+from l3r.files import write_atomic
 from l3r.train.csv_table import append_row, drop_rows_after
 from l3r.train.sinks import Sink
 from l3r.types import Views
+from l3r.version import __version__
 
 
 class DatasetMeans:
@@ -81,9 +88,14 @@ class RunLog(Callback):
         folder: The run's folder.
         every: Steps between training rows.
         sinks: Other places for the same rows.
+        pictures: Whether to draw the first validation graph at each validation.
     """
 
-    def __init__(self, folder: Path, every: int, sinks: Sequence[Sink] = ()) -> None:
+    def __init__(
+        self, folder: Path, every: int, sinks: Sequence[Sink] = (), *, pictures: bool = False
+    ) -> None:
+        self.folder = folder
+        self.pictures = pictures
         self.training = folder / "metrics.csv"
         self.validation = folder / "validation.csv"
         self.every = every
@@ -97,6 +109,7 @@ class RunLog(Callback):
         if trainer.is_global_zero:
             for path in (self.training, self.validation):
                 drop_rows_after(path, trainer.global_step)
+            write_machine(self.folder / "machine.json", trainer)
             for sink in self.sinks:
                 sink.start(trainer.global_step)
 
@@ -120,6 +133,25 @@ class RunLog(Callback):
         if torch.cuda.is_available():
             row["gpu_gib"] = torch.cuda.max_memory_allocated() / 2**30
         self._write(trainer, "train", row | self.datasets.take())
+
+    def on_validation_batch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Views,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Draw the first graph."""
+        if batch_idx or not self.pictures or not trainer.is_global_zero:
+            return
+        step = trainer.global_step
+        path = self.folder / "pictures" / f"step_{step:06d}.png"
+        path.parent.mkdir(exist_ok=True)
+        write_graph_sheet(path, outputs["scene"], batch)
+        for sink in self.sinks:
+            sink.add_picture(step, path)
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Write a validation row."""
@@ -153,6 +185,24 @@ class RunLog(Callback):
         append_row(path, {"step": float(step), **row})
         for sink in self.sinks:
             sink.write(step, {f"{kind}/{name}": value for name, value in row.items()})
+
+
+def write_machine(path: Path, trainer: L.Trainer) -> None:
+    """Note what a run is computed on, at each start."""
+    device = trainer.strategy.root_device
+    facts = {
+        "host": platform.node(),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU",
+        "processes": trainer.world_size,
+        "CPU cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "light3r": __version__,
+        "torch": str(torch.__version__),
+        "python": platform.python_version(),
+        "started at step": trainer.global_step,
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    write_atomic(path, json.dumps(facts, indent=1) + "\n")
 
 
 def _numbers(metrics: Mapping[str, Tensor], prefix: str) -> dict[str, float]:

@@ -6,12 +6,15 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import pytest
 import torch
 
 import l3r
+from l3r.cli.main import main
 from l3r.config import from_plain, load_config
 from l3r.errors import CheckpointError, ConfigError, LaunchError
+from l3r.export.graph_sheet import CELL
 from l3r.inference.checkpoint import load_model_and_config, read_checkpoint
 from l3r.loss.joint import JointLoss
 from l3r.train.run import train
@@ -65,6 +68,26 @@ def test_a_run_leaves_its_log_its_configuration_and_its_weights(finished, hand_s
     assert config == load_config(layers(hand_shards, finished, max_steps=12))
     assert not model.training
     assert load_config([str(finished / "config.yaml")]) == config
+
+
+def test_each_validation_draws_its_first_graph(finished):
+    names = ["step_000005.png", "step_000010.png"]
+    assert sorted(path.name for path in (finished / "pictures").iterdir()) == names
+    sheet = cv2.imread(str(finished / "pictures" / names[1]))
+    assert sheet.shape == (4 * (CELL + 4), 76 + 3 * (CELL + 4), 3)
+
+
+def test_a_finished_run_has_a_report_with_its_pictures(finished, tmp_path, capsys):
+    page = tmp_path / "page.html"
+    assert main(["report", str(finished), "--out", str(page)]) == 0
+    assert capsys.readouterr().out.startswith("finished: step 12 of 12")
+    text = page.read_text()
+    assert all(f"<h3>Step {step}</h3>" in text for step in (5, 10))
+    assert f"threads</td><td>{torch.get_num_threads()}" in text
+    # All that was logged can be drawn: no file is missing or damaged.
+    assert "Missing or damaged" not in text
+    for title in ("RRA", "Norm of the gradient", "Trees", "Mean log-confidence"):
+        assert title in text
 
 
 def test_checkpoints_read_without_pickles_and_carry_the_configuration(finished):
