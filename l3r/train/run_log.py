@@ -3,7 +3,6 @@
 import json
 import os
 import platform
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -27,46 +26,44 @@ from l3r.version import __version__
 class DatasetMeans:
     """Means of figures over the graphs of each data set, since they were last taken.
 
-    Adding does not wait for the device; taking does.
+    Values that are not finite are left out: their steps are skipped. Adding does not wait for the
+    device; taking does.
     """
 
     def __init__(self) -> None:
-        self._sums: dict[str, Tensor] = {}
-        self._counts: dict[str, int] = defaultdict(int)
+        self._totals: dict[str, Float[Tensor, " 2"]] = {}  # sum and count
 
     def add(self, datasets: Sequence[str], figures: Mapping[str, Float[Tensor, " b"]]) -> None:
         """Add the figures of a batch's graphs."""
-        # Picked apart on the host: an index on the device would have to be sent there.
-        for index, dataset in enumerate(datasets):
-            self._counts[dataset] += 1
-            for name, values in figures.items():
+        for name, values in figures.items():
+            is_finite = values.isfinite()
+            known = torch.where(is_finite, values, torch.zeros_like(values))
+            pairs = torch.stack([known, is_finite.to(values.dtype)], dim=1).detach()
+            # Picked apart on the host: an index on the device would have to be sent there.
+            for dataset, pair in zip(datasets, pairs, strict=True):
                 key = f"{dataset}/{name}"
-                value = values[index].detach()
-                self._sums[key] = self._sums[key] + value if key in self._sums else value
+                before = self._totals.get(key)
+                # What a checkpoint kept lies on the host.
+                self._totals[key] = pair if before is None else pair + before.to(pair.device)
 
     def take(self) -> dict[str, float]:
-        """Give the means over all devices, ``DATASET/FIGURE``, and start anew."""
-        own = {key: (float(sum_), self._count_of(key)) for key, sum_ in self._sums.items()}
-        self._sums.clear()
-        self._counts.clear()
+        """Give the means over all processes, ``DATASET/FIGURE``, and start anew."""
+        own = {key: total.tolist() for key, total in self._totals.items()}
+        self._totals.clear()
         totals: dict[str, list[float]] = {}
         for part in gather(own):
             for key, (sum_, count) in part.items():
-                total = totals.setdefault(key, [0.0, 0.0])
-                total[0], total[1] = total[0] + sum_, total[1] + count
-        return {key: sum_ / count for key, (sum_, count) in sorted(totals.items())}
+                before = totals.get(key, [0.0, 0.0])
+                totals[key] = [before[0] + sum_, before[1] + count]
+        return {key: sum_ / count for key, (sum_, count) in sorted(totals.items()) if count}
 
     def state_dict(self) -> dict[str, Any]:
         """Give what a checkpoint keeps, so that a resumed run's next row is the same."""
-        return {"sums": dict(self._sums), "counts": dict(self._counts)}
+        return dict(self._totals)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Take up the state of a checkpoint."""
-        self._sums = dict(state["sums"])
-        self._counts = defaultdict(int, state["counts"])
-
-    def _count_of(self, key: str) -> int:
-        return self._counts[key.rsplit("/", 1)[0]]
+        self._totals = dict(state)
 
 
 def gather(own: Any) -> list[Any]:

@@ -31,6 +31,13 @@ def test_means_of_data_sets_do_not_depend_on_how_graphs_came_in_batches(graphs, 
     assert means.take() == {}
 
 
+def test_graphs_of_skipped_steps_do_not_count():
+    means = DatasetMeans()
+    means.add(["a", "a", "b"], {"loss": torch.tensor([1.0, torch.nan, torch.inf])})
+    means.add(["a"], {"loss": torch.tensor([2.0])})
+    assert means.take() == {"a/loss": 1.5}
+
+
 def read(path):
     with path.open(newline="") as stream:
         return list(csv.DictReader(stream))
