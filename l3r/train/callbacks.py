@@ -1,7 +1,6 @@
-"""What happens around a step: guard, log, progress."""
+"""What happens around a step: timing, log, progress."""
 
 import csv
-import json
 import math
 import sys
 import time
@@ -10,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
-import torch
 from lightning.pytorch.callbacks import Callback
 from rich.console import Console
 from rich.progress import (
@@ -21,63 +19,11 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from torch import Tensor
-from torch.nn.utils import get_total_norm
 
 from l3r.errors import LaunchError
 from l3r.files import write_atomic
+from l3r.train.ranks import step_is_whole
 from l3r.types import Views
-
-
-class GradientGuard(Callback):
-    """Skips a step whose loss or gradient is not finite, on all devices alike.
-
-    The keys of the step's graphs are added to ``bad_steps.jsonl``. Also measures the gradient's
-    norm, as ``train/grad_norm``.
-
-    Args:
-        path: Where bad steps are written down.
-        max_bad_steps: Training stops after so many in a row.
-    """
-
-    def __init__(self, path: Path, max_bad_steps: int) -> None:
-        self.path = path
-        self.max_bad_steps = max_bad_steps
-        self.bad_in_a_row = 0
-        self.keys: list[str] = []
-
-    def on_train_batch_start(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Views, batch_idx: int
-    ) -> None:
-        """Remember which graphs the step is made of."""
-        self.keys = batch.key
-
-    def on_before_optimizer_step(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: torch.optim.Optimizer
-    ) -> None:
-        """Drop the gradients of a bad step: the optimiser leaves parameters without one alone."""
-        parameters = [p for p in pl_module.parameters() if p.grad is not None]
-        norm = get_total_norm([p.grad for p in parameters if p.grad is not None])
-        pl_module.log("train/grad_norm", norm)
-        loss = trainer.callback_metrics.get("train/loss", norm)
-        is_good = bool(torch.isfinite(norm) & torch.isfinite(loss))
-        if trainer.strategy.reduce_boolean_decision(is_good, all=True):
-            self.bad_in_a_row = 0
-            return
-        for parameter in parameters:
-            parameter.grad = None
-        self._record(trainer.global_step, float(loss), float(norm))
-
-    def _record(self, step: int, loss: float, norm: float) -> None:
-        self.bad_in_a_row += 1
-        row = {"step": step, "loss": str(loss), "grad_norm": str(norm), "keys": self.keys}
-        with self.path.open("a") as stream:
-            stream.write(json.dumps(row) + "\n")
-        if self.bad_in_a_row >= self.max_bad_steps:
-            raise LaunchError(
-                f"step {step}: loss {loss}, gradient norm {norm}; {self.bad_in_a_row} such steps "
-                f"in a row, fewer than train.max_bad_steps={self.max_bad_steps} expected; their "
-                f"graphs are listed in {self.path}"
-            )
 
 
 class StepTimer(Callback):
@@ -154,6 +100,8 @@ class CsvLog(Callback):
         batch_idx: int,
     ) -> None:
         """Write a training row."""
+        if not step_is_whole(trainer, batch_idx):
+            return
         step = trainer.global_step
         if step % self.every == 0 or step == trainer.max_steps:
             rate = trainer.optimizers[0].param_groups[0]["lr"]
@@ -198,6 +146,8 @@ class StepProgress(Callback):
         batch_idx: int,
     ) -> None:
         """Move the bar; look at the loss only now and then, since that waits for the device."""
+        if not step_is_whole(trainer, batch_idx):
+            return
         step, total = trainer.global_step, trainer.max_steps
         if self.progress is not None:
             task = self.progress.task_ids[0]
