@@ -1,6 +1,7 @@
 """One training run: parse nothing, build, fit, write."""
 
 import logging
+import signal
 import sys
 import warnings
 from pathlib import Path
@@ -74,6 +75,9 @@ def train(config: RunConfig) -> Path:
             explained = explain_failure(error, ranks, config.train)
             if explained is None:
                 raise
+            if trainer.strategy.launcher is not None:
+                # Those that this process started, and that may hang; srun ends its own.
+                trainer.strategy.launcher.kill(signal.SIGKILL)
             raise explained from error
     if files.problem:
         raise CheckpointError(f"{last}: the end cannot be saved ({files.problem}); make room")
@@ -141,5 +145,6 @@ def _build_trainer(
 
 def _quieten_lightning() -> None:
     """Keep lightning's advertisements and its advice on other loaders out of the terminal."""
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", module="lightning.*")
