@@ -11,7 +11,7 @@ import lightning as L
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from lightning.pytorch.callbacks import Checkpoint
 
-from l3r.config import RunConfig, TrainConfig, from_plain, to_plain
+from l3r.config import RunConfig, from_plain, to_plain
 from l3r.errors import CheckpointError, ConfigError, LaunchError
 from l3r.files import hidden_sibling, hidden_siblings
 from l3r.inference.checkpoint import read_checkpoint
@@ -99,19 +99,21 @@ class StepCheckpoint(Checkpoint):
 
     Args:
         path: The checkpoint.
-        config: Intervals.
+        config: Of the run.
         signals: What has come in.
         agreement: With the other processes.
     """
 
     def __init__(
-        self, path: Path, config: TrainConfig, signals: StopSignals, agreement: Agreement
+        self, path: Path, config: RunConfig, signals: StopSignals, agreement: Agreement
     ) -> None:
         self.path = path
-        self.config = config
+        self.config = config.train
+        self.has_validation = bool(config.data.validation)
         self.signals = signals
         self.agreement = agreement
         self.saved_at = 0.0
+        self.is_owed = False
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         """Connect to the other processes."""
@@ -145,11 +147,24 @@ class StepCheckpoint(Checkpoint):
         requeue, end, late = self.agreement.any(
             [SAVE_AND_REQUEUE in self.signals, SAVE_AND_END in self.signals, is_late]
         )
-        if requeue or end or late or step % self.config.checkpoint_every == 0:
-            trainer.save_checkpoint(self.path)
-            self.saved_at = time.monotonic()
+        is_asked = requeue or end
+        if is_asked or late or step % self.config.checkpoint_every == 0:
+            # Where a validation comes next, lightning would not go back to it from here.
+            self.is_owed = self.has_validation and step % self.config.validate_every == 0
+            if is_asked or not self.is_owed:
+                self._save(trainer)
         if (requeue or end) and step < trainer.max_steps:
             self._stop(trainer, "SIGTERM" if end else "SIGUSR1")
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Save what was due at the step before."""
+        if self.is_owed:
+            self._save(trainer)
+
+    def _save(self, trainer: L.Trainer) -> None:
+        trainer.save_checkpoint(self.path)
+        self.saved_at = time.monotonic()
+        self.is_owed = False
 
     def _stop(self, trainer: L.Trainer, name: str) -> None:
         said = f"{name}: step {trainer.global_step} is saved in {self.path}"

@@ -110,7 +110,7 @@ def _build_callbacks(config: RunConfig, ranks: Ranks, signals: StopSignals) -> l
     ]
     if ranks.is_first:
         callbacks += [CsvLog(folder, train.log_every), StepProgress()]
-    return [*callbacks, StepCheckpoint(folder / "last.ckpt", train, signals, agreement)]
+    return [*callbacks, StepCheckpoint(folder / "last.ckpt", config, signals, agreement)]
 
 
 def _build_trainer(

@@ -121,6 +121,32 @@ def test_sigusr1_outside_slurm_saves_and_goes_on(hand_shards, finished, tmp_path
     assert_equal_to_the_last_bit(tmp_path, finished)
 
 
+@pytest.mark.parametrize(("kill_at", "saved"), [("validation", 3), ("training", 6)])
+def test_no_validation_is_lost_or_made_twice(
+    hand_shards, finished, tmp_path, monkeypatch, kill_at, saved
+):
+    """A run that ends in or after the validation of step 6, where a checkpoint is due as well."""
+    name = f"{kill_at}_step"
+    step = getattr(TrainModule, name)
+
+    def fail(self, batch, batch_idx):
+        if self.trainer.global_step == 6:
+            raise KeyError("gone")
+        return step(self, batch, batch_idx)
+
+    often = {"validate_every": 3, "checkpoint_every": 3}
+    train(config(hand_shards, tmp_path / "straight", **often))
+    with monkeypatch.context() as patch:
+        patch.setattr(TrainModule, name, fail)
+        with pytest.raises(KeyError, match="gone"):
+            train(config(hand_shards, tmp_path / "stopped", **often))
+    assert read_checkpoint(tmp_path / "stopped" / "last.ckpt")["global_step"] == saved
+    train(config(hand_shards, tmp_path / "stopped", **often))
+    logs = [(tmp_path / n / "validation.csv").read_text() for n in ("straight", "stopped")]
+    assert logs[0] == logs[1]
+    assert_equal_to_the_last_bit(tmp_path / "stopped", finished)
+
+
 def test_a_checkpoint_is_made_when_its_minutes_are_over(hand_shards, tmp_path, call_at):
     call_at(3, lambda: time.sleep(1))
     train(config(hand_shards, tmp_path, checkpoint_minutes=1e-9, max_steps=4))
