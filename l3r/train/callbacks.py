@@ -1,10 +1,8 @@
-"""What happens around a step: guard, measure, progress."""
+"""What happens around a step: measures and progress."""
 
-import json
 import math
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import lightning as L
@@ -20,60 +18,8 @@ from rich.progress import (
 )
 from torch.nn.utils import get_total_norm
 
-from l3r.errors import LaunchError
+from l3r.train.ranks import step_is_whole
 from l3r.types import Views
-
-
-class GradientGuard(Callback):
-    """Skips a step whose loss or gradient is not finite, on all devices alike.
-
-    The keys of the step's graphs are added to ``bad_steps.jsonl``. Also measures the gradient's
-    norm, as ``train/grad_norm``.
-
-    Args:
-        path: Where bad steps are written down.
-        max_bad_steps: Training stops after so many in a row.
-    """
-
-    def __init__(self, path: Path, max_bad_steps: int) -> None:
-        self.path = path
-        self.max_bad_steps = max_bad_steps
-        self.bad_in_a_row = 0
-        self.keys: list[str] = []
-
-    def on_train_batch_start(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Views, batch_idx: int
-    ) -> None:
-        """Remember which graphs the step is made of."""
-        self.keys = batch.key
-
-    def on_before_optimizer_step(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: torch.optim.Optimizer
-    ) -> None:
-        """Drop the gradients of a bad step: the optimiser leaves parameters without one alone."""
-        parameters = [p for p in pl_module.parameters() if p.grad is not None]
-        norm = get_total_norm([p.grad for p in parameters if p.grad is not None])
-        pl_module.log("train/grad_norm", norm)
-        loss = trainer.callback_metrics.get("train/loss", norm)
-        is_good = bool(torch.isfinite(norm) & torch.isfinite(loss))
-        if trainer.strategy.reduce_boolean_decision(is_good, all=True):
-            self.bad_in_a_row = 0
-            return
-        for parameter in parameters:
-            parameter.grad = None
-        self._record(trainer.global_step, float(loss), float(norm))
-
-    def _record(self, step: int, loss: float, norm: float) -> None:
-        self.bad_in_a_row += 1
-        row = {"step": step, "loss": str(loss), "grad_norm": str(norm), "keys": self.keys}
-        with self.path.open("a") as stream:
-            stream.write(json.dumps(row) + "\n")
-        if self.bad_in_a_row >= self.max_bad_steps:
-            raise LaunchError(
-                f"step {step}: loss {loss}, gradient norm {norm}; {self.bad_in_a_row} such steps "
-                f"in a row, fewer than train.max_bad_steps={self.max_bad_steps} expected; their "
-                f"graphs are listed in {self.path}"
-            )
 
 
 class StepTimer(Callback):
@@ -159,9 +105,9 @@ class StepProgress(Callback):
         self.began = (0, 0.0)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Open the bar."""
+        """Open the bar, on the first process."""
         self.began = (trainer.global_step, time.perf_counter())
-        if self.console.is_terminal:
+        if self.console.is_terminal and trainer.is_global_zero:
             self.progress = Progress(
                 TextColumn("train"),
                 BarColumn(bar_width=None),
@@ -182,6 +128,8 @@ class StepProgress(Callback):
         batch_idx: int,
     ) -> None:
         """Move the bar; look at the loss only now and then, since that waits for the device."""
+        if not trainer.is_global_zero or not step_is_whole(trainer, batch_idx):
+            return
         step, total = trainer.global_step, trainer.max_steps
         if self.progress is not None:
             task = self.progress.task_ids[0]

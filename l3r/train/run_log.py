@@ -18,6 +18,7 @@ from torch import Tensor
 from l3r.export.graph_sheet import write_graph_sheet
 from l3r.files import write_atomic
 from l3r.train.csv_table import append_row, drop_rows_after
+from l3r.train.ranks import step_is_whole
 from l3r.train.sinks import Sink
 from l3r.types import Views
 from l3r.version import __version__
@@ -98,11 +99,9 @@ class RunLog(Callback):
         self.every = every
         self.sinks = sinks
         self.datasets = DatasetMeans()
-        self.written = -1
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Forget what a stopped run wrote after its checkpoint."""
-        self.written = trainer.global_step
         if trainer.is_global_zero:
             for path in (self.training, self.validation):
                 drop_rows_after(path, trainer.global_step)
@@ -122,9 +121,8 @@ class RunLog(Callback):
         self.datasets.add(batch.dataset, outputs["graphs"])
         step = trainer.global_step
         is_due = step % self.every == 0 or step == trainer.max_steps
-        if not is_due or step == self.written:
+        if not is_due or not step_is_whole(trainer, batch_idx):
             return
-        self.written = step
         row = {"lr": float(trainer.optimizers[0].param_groups[0]["lr"])}
         row |= _mean_over_processes(_numbers(trainer.callback_metrics, "train/"))
         if torch.cuda.is_available():
