@@ -4,6 +4,7 @@ from l3r.config.data import DataConfig, SourceConfig
 from l3r.config.graph import GraphConfig
 from l3r.config.inference import InferenceConfig
 from l3r.config.layers import from_plain, load_config, override_config, to_plain, to_yaml
+from l3r.config.logs import LogsConfig
 from l3r.config.loss import LossConfig
 from l3r.config.model import (
     AlignmentConfig,
@@ -24,6 +25,7 @@ __all__ = [
     "EncoderConfig",
     "GraphConfig",
     "InferenceConfig",
+    "LogsConfig",
     "LossConfig",
     "ModelConfig",
     "Precision",

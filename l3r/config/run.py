@@ -6,6 +6,7 @@ from l3r.config.check import require
 from l3r.config.data import DataConfig
 from l3r.config.graph import GraphConfig
 from l3r.config.inference import InferenceConfig
+from l3r.config.logs import LogsConfig
 from l3r.config.loss import LossConfig
 from l3r.config.model import ModelConfig
 from l3r.config.train import TrainConfig
@@ -25,6 +26,8 @@ class RunConfig:
     """Sources and batches."""
     train: TrainConfig = field(default_factory=TrainConfig)
     """Optimisation."""
+    logs: LogsConfig = field(default_factory=LogsConfig)
+    """What a run writes about itself."""
     inference: InferenceConfig = field(default_factory=InferenceConfig)
     """Reconstruction."""
 

@@ -40,6 +40,8 @@ class TrainConfig:
     """Stop after so many steps in a row with a loss or gradient that is not finite."""
     checkpoint_every: int = 1000
     """Steps between checkpoints."""
+    checkpoint_minutes: float | None = None
+    """A checkpoint after so many minutes without one too; null: by steps alone."""
     validate_every: int = 1000
     """Steps between validations."""
     validation_graphs: int = 32
@@ -48,6 +50,15 @@ class TrainConfig:
     """Steps between rows of ``metrics.csv``."""
     accelerator: Literal["auto", "cpu", "gpu"] = "auto"
     """Where to train; ``auto`` takes a GPU if there is one."""
+    devices: int | None = None
+    """Processes on each node, one for each device; null: as many as srun started, else one."""
+    num_nodes: int | None = None
+    """Nodes; null: as many as srun started processes on, else one."""
+    accumulate: int = 1
+    """Batches in which a device takes its graphs of a step, one after the other: memory for time.
+    ``data.graphs_per_step`` is that of all devices and batches."""
+    timeout_minutes: float = 30.0
+    """The run ends when a process has waited for another for so long."""
     precision: Precision = "fp32"
     """Of encoder, alignment and decoder; weights, heads, Procrustes and loss stay in float32."""
     compile: bool = False
@@ -65,6 +76,12 @@ class TrainConfig:
             "max_bad_steps",
         ):
             require(getattr(self, key) >= 1, f"train.{key}", getattr(self, key), "1 or more")
+        for key in ("devices", "num_nodes", "accumulate"):
+            value = getattr(self, key)
+            require(value is None or value >= 1, f"train.{key}", value, "1 or more")
+        for key in ("timeout_minutes", "checkpoint_minutes"):
+            value = getattr(self, key)
+            require(value is None or value > 0, f"train.{key}", value, "more than 0")
         for key in ("warmup_steps", "weight_decay", "validation_graphs", "min_lr_ratio"):
             require(getattr(self, key) >= 0, f"train.{key}", getattr(self, key), "0 or more")
         require(self.lr > 0, "train.lr", self.lr, "more than 0")

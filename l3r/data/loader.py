@@ -27,6 +27,8 @@ log = logging.getLogger(__name__)
 LOG_SKIP_EVERY = 100
 SKIP_WINDOW = 1000
 """Samples over which the rate of unreadable ones is taken."""
+GRACE_SECONDS = 10
+"""For how long a loader process that is told to end goes on delivering."""
 
 Item = TypeVar("Item")
 
@@ -217,6 +219,8 @@ def _settle(worker: int) -> None:
     cv2.setNumThreads(1)
     for number in (signal.SIGINT, signal.SIGUSR1, signal.SIGUSR2):
         signal.signal(number, signal.SIG_IGN)
+    # SLURM sends this one to every process of a job; the run saves first, and may need a batch.
+    signal.signal(signal.SIGTERM, lambda *_: signal.alarm(GRACE_SECONDS))
 
 
 def _warn_of_idle_settings(config: DataConfig) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import jinja2
 import torch
 
+from l3r.export.durations import format_seconds
 from l3r.export.plan import draw_plan, edge_steps, tree_similarity
 from l3r.export.run_json import RunRecord, num_components
 from l3r.export.thumbnails import Picture, confidence_picture, depth_picture, photo_picture
@@ -57,17 +58,6 @@ def render_report(
         images=_image_cards(scene, shown),
         num_images=len(scene.cameras.file),
     )
-
-
-def format_seconds(seconds: float) -> str:
-    """Three digits and a unit."""
-    if seconds < 1:
-        return f"{seconds * 1000:.0f} ms"
-    if seconds < 60:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s"
 
 
 def _summary(scene: Reconstruction, seconds: Mapping[str, float]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
 LONG_SIDE = 320
@@ -44,23 +44,33 @@ def depth_picture(depth: Float[Tensor, "h w"]) -> Picture:
 
     The colours span its own 2nd to 98th percentile, on a logarithmic scale.
     """
-    values = _shrunk(depth.float().cpu().numpy(), cv2.INTER_NEAREST)
+    return _picture(*depth_colors(_shrunk(depth.float().cpu().numpy(), cv2.INTER_NEAREST)))
+
+
+def depth_colors(values: Float32[np.ndarray, "h w"]) -> tuple[UInt8[np.ndarray, "h w 3"], str]:
+    """Colour a depth map as :func:`depth_picture` does; BGR, and what the colours span."""
     known = np.isfinite(values) & (values > 0)
     if not known.any():
-        return _picture(np.full((*values.shape, 3), _UNKNOWN_GREY, np.uint8), "no depth")
+        return np.full((*values.shape, 3), _UNKNOWN_GREY, np.uint8), "no depth"
     low, high = np.percentile(values[known], [2, 98])
     level = 1 - _log_level(np.where(known, values, low), low, high)
     colored = cv2.applyColorMap((level * 255).astype(np.uint8), cv2.COLORMAP_TURBO)
     colored[~known] = _UNKNOWN_GREY
-    return _picture(colored, f"{low:.3g} to {high:.3g}")
+    return colored, f"{low:.3g} to {high:.3g}"
 
 
 def confidence_picture(conf: Float[Tensor, "h w"], highest: float) -> Picture:
     """Colour a confidence map, logarithmic from 1 (dark) to ``highest`` (bright)."""
     values = _shrunk(conf.float().cpu().numpy(), cv2.INTER_NEAREST)
+    return _picture(confidence_colors(values, highest), f"median {float(np.median(values)):.3g}")
+
+
+def confidence_colors(
+    values: Float32[np.ndarray, "h w"], highest: float
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Colour a confidence map as :func:`confidence_picture` does; BGR."""
     level = _log_level(values, 1.0, highest)
-    colored = cv2.applyColorMap((level * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
-    return _picture(colored, f"median {float(np.median(values)):.3g}")
+    return np.asarray(cv2.applyColorMap((level * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS))
 
 
 def _log_level(values: np.ndarray, low: float, high: float) -> np.ndarray:

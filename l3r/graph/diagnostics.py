@@ -71,6 +71,22 @@ def diagnose_tree(
     )
 
 
+def summarise_trees(tree: SceneTree) -> dict[str, float]:
+    """Describe the trees of a batch in few numbers, which show a collapse to stars.
+
+    Returns:
+        ``root_degree``: mean number of edges at the root; ``root_degree_max``: the largest of the
+        batch, n - 1 for a star; ``tree_depth``: mean number of edges from the root to the
+        farthest view, 1 for a star.
+    """
+    degrees = (tree.level == 1).sum(1)
+    return {
+        "root_degree": float(degrees.double().mean()),
+        "root_degree_max": float(degrees.max()),
+        "tree_depth": float(tree.level.amax(1).double().mean()),
+    }
+
+
 def split_components(
     tree: SceneTree,
     scores: Float[Tensor, "n n"],

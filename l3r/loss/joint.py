@@ -22,6 +22,8 @@ class LossTerms:
     """What is minimised."""
     parts: dict[str, Float[Tensor, ""]]
     """Detached terms and errors, for the log."""
+    graphs: dict[str, Float[Tensor, " b"]]
+    """``loss`` and ``pair_error`` of each graph alone, detached, for the log of each data set."""
 
     def scalars(self, prefix: str) -> dict[str, Tensor]:
         """Name every number for the log: ``prefix/loss``, ``prefix/pairwise``, ..."""
@@ -58,5 +60,10 @@ class JointLoss(nn.Module):
             "pair_error": pairwise.error,
             "global_error": world.error,
         }
-        total = pairwise.loss + self.config.global_weight * world.loss
-        return LossTerms(total=total, parts=parts)
+        weight = self.config.global_weight
+        graphs = {
+            "loss": pairwise.graph_loss + weight * world.graph_loss,
+            "pair_error": pairwise.graph_error,
+        }
+        total = pairwise.loss + weight * world.loss
+        return LossTerms(total=total, parts=parts, graphs=graphs)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from l3r.config import LossConfig
 from l3r.loss.confidence import confidence_loss, point_error
-from l3r.loss.reduction import mean_over_pixels
+from l3r.loss.reduction import mean_of_each_graph, mean_over_pixels
 from l3r.loss.scale import ScaleFactors
 from l3r.loss.targets import PairTargets
 from l3r.types import PairPointmaps
@@ -21,6 +21,10 @@ class TermValue:
     """What is minimised."""
     error: Float[Tensor, ""]
     """Mean point error in units of the scene's scale, without confidence; for the log."""
+    graph_loss: Float[Tensor, " b"]
+    """``loss`` of each graph alone, detached; for the log."""
+    graph_error: Float[Tensor, " b"]
+    """``error`` of each graph alone."""
 
 
 def pairwise_loss(
@@ -48,7 +52,12 @@ def pairwise_loss(
         target.child_valid,
         config,
     )
-    return TermValue(loss=parent.loss + child.loss, error=(parent.error + child.error) / 2)
+    return TermValue(
+        loss=parent.loss + child.loss,
+        error=(parent.error + child.error) / 2,
+        graph_loss=parent.graph_loss + child.graph_loss,
+        graph_error=(parent.graph_error + child.graph_error) / 2,
+    )
 
 
 def _divide(pts3d: Float[Tensor, "b e p 3"], factor: Float[Tensor, "b k"]) -> Tensor:
@@ -68,4 +77,6 @@ def _view_loss(
     return TermValue(
         loss=mean_over_pixels(loss, valid, config.reduction),
         error=mean_over_pixels(error.detach(), valid, config.reduction),
+        graph_loss=mean_of_each_graph(loss.detach(), valid),
+        graph_error=mean_of_each_graph(error.detach(), valid),
     )

@@ -22,4 +22,11 @@ def mean_over_pixels(
     """
     if reduction == "pooled":
         return values.sum() / valid.sum().clamp_min(1)
-    return (values.sum(-1) / valid.sum(-1).clamp_min(1)).mean()
+    return mean_of_each_graph(values, valid).mean()
+
+
+def mean_of_each_graph(
+    values: Float[Tensor, "b m"], valid: Bool[Tensor, "b m"]
+) -> Float[Tensor, " b"]:
+    """Average a per-pixel loss, 0 where not valid, over each graph's valid pixels."""
+    return values.sum(-1) / valid.sum(-1).clamp_min(1)

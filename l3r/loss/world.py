@@ -7,7 +7,7 @@ from l3r.config import LossConfig
 from l3r.geometry.similarity import fit_similarity
 from l3r.loss.confidence import confidence_loss, point_error
 from l3r.loss.pairwise import TermValue
-from l3r.loss.reduction import mean_over_pixels
+from l3r.loss.reduction import mean_of_each_graph, mean_over_pixels
 from l3r.loss.scale import ScaleFactors
 from l3r.loss.targets import WorldTargets
 from l3r.types import WorldPointmaps
@@ -44,6 +44,8 @@ def world_loss(
     return TermValue(
         loss=mean_over_pixels(loss, valid, config.reduction),
         error=mean_over_pixels(error.detach(), valid, config.reduction),
+        graph_loss=mean_of_each_graph(loss.detach(), valid),
+        graph_error=mean_of_each_graph(error.detach(), valid),
     )
 
 

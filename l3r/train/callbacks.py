@@ -1,12 +1,8 @@
-"""What happens around a step: guard, log, progress."""
+"""What happens around a step: measures and progress."""
 
-import csv
-import json
 import math
 import sys
 import time
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import lightning as L
@@ -20,64 +16,10 @@ from rich.progress import (
     TextColumn,
     TimeRemainingColumn,
 )
-from torch import Tensor
 from torch.nn.utils import get_total_norm
 
-from l3r.errors import LaunchError
-from l3r.files import write_atomic
+from l3r.train.ranks import step_is_whole
 from l3r.types import Views
-
-
-class GradientGuard(Callback):
-    """Skips a step whose loss or gradient is not finite, on all devices alike.
-
-    The keys of the step's graphs are added to ``bad_steps.jsonl``. Also measures the gradient's
-    norm, as ``train/grad_norm``.
-
-    Args:
-        path: Where bad steps are written down.
-        max_bad_steps: Training stops after so many in a row.
-    """
-
-    def __init__(self, path: Path, max_bad_steps: int) -> None:
-        self.path = path
-        self.max_bad_steps = max_bad_steps
-        self.bad_in_a_row = 0
-        self.keys: list[str] = []
-
-    def on_train_batch_start(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Views, batch_idx: int
-    ) -> None:
-        """Remember which graphs the step is made of."""
-        self.keys = batch.key
-
-    def on_before_optimizer_step(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: torch.optim.Optimizer
-    ) -> None:
-        """Drop the gradients of a bad step: the optimiser leaves parameters without one alone."""
-        parameters = [p for p in pl_module.parameters() if p.grad is not None]
-        norm = get_total_norm([p.grad for p in parameters if p.grad is not None])
-        pl_module.log("train/grad_norm", norm)
-        loss = trainer.callback_metrics.get("train/loss", norm)
-        is_good = bool(torch.isfinite(norm) & torch.isfinite(loss))
-        if trainer.strategy.reduce_boolean_decision(is_good, all=True):
-            self.bad_in_a_row = 0
-            return
-        for parameter in parameters:
-            parameter.grad = None
-        self._record(trainer.global_step, float(loss), float(norm))
-
-    def _record(self, step: int, loss: float, norm: float) -> None:
-        self.bad_in_a_row += 1
-        row = {"step": step, "loss": str(loss), "grad_norm": str(norm), "keys": self.keys}
-        with self.path.open("a") as stream:
-            stream.write(json.dumps(row) + "\n")
-        if self.bad_in_a_row >= self.max_bad_steps:
-            raise LaunchError(
-                f"step {step}: loss {loss}, gradient norm {norm}; {self.bad_in_a_row} such steps "
-                f"in a row, fewer than train.max_bad_steps={self.max_bad_steps} expected; their "
-                f"graphs are listed in {self.path}"
-            )
 
 
 class StepTimer(Callback):
@@ -124,46 +66,34 @@ class StepTimer(Callback):
         self.ended = time.perf_counter()
 
 
-class CsvLog(Callback):
-    """Writes ``metrics.csv`` (training) and ``validation.csv`` in a folder, one row a time.
+class RoomGradients(Callback):
+    """Measures the gradient's norm in each room of the network, on steps that are logged.
 
-    A resumed run first drops the rows after its checkpoint, so that a file reads as if the run
-    had never stopped.
+    Logs ``train/grad_norm_encoder`` and so on, before clipping.
 
     Args:
-        folder: The run's folder.
-        every: Steps between training rows.
+        every: Steps between rows of the log.
     """
 
-    def __init__(self, folder: Path, every: int) -> None:
-        self.training = folder / "metrics.csv"
-        self.validation = folder / "validation.csv"
+    def __init__(self, every: int) -> None:
         self.every = every
 
-    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Forget what a stopped run wrote after its checkpoint."""
-        for path in (self.training, self.validation):
-            _drop_rows_after(path, trainer.global_step)
-
-    def on_train_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: Any,
-        batch: Views,
-        batch_idx: int,
+    def on_before_optimizer_step(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: torch.optim.Optimizer
     ) -> None:
-        """Write a training row."""
-        step = trainer.global_step
-        if step % self.every == 0 or step == trainer.max_steps:
-            rate = trainer.optimizers[0].param_groups[0]["lr"]
-            row = _numbers(trainer.callback_metrics, "train/")
-            _append_row(self.training, {"step": float(step), "lr": float(rate), **row})
-
-    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Write a validation row."""
-        row = _numbers(trainer.callback_metrics, "val/")
-        _append_row(self.validation, {"step": float(trainer.global_step), **row})
+        """Measure without waiting for the device."""
+        step = trainer.global_step + 1
+        if step % self.every and step != trainer.max_steps:
+            return
+        norms: dict[str, list[torch.Tensor]] = {
+            room: [] for room in ("encoder", "alignment", "decoder", "heads")
+        }
+        for name, parameter in pl_module.named_parameters():
+            if parameter.grad is not None:
+                room = name.removeprefix("model.").split(".")[0]
+                norms["heads" if room.endswith("_head") else room].append(parameter.grad)
+        for room, gradients in norms.items():
+            pl_module.log(f"train/grad_norm_{room}", get_total_norm(gradients))
 
 
 class StepProgress(Callback):
@@ -175,9 +105,9 @@ class StepProgress(Callback):
         self.began = (0, 0.0)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Open the bar."""
+        """Open the bar, on the first process."""
         self.began = (trainer.global_step, time.perf_counter())
-        if self.console.is_terminal:
+        if self.console.is_terminal and trainer.is_global_zero:
             self.progress = Progress(
                 TextColumn("train"),
                 BarColumn(bar_width=None),
@@ -198,6 +128,8 @@ class StepProgress(Callback):
         batch_idx: int,
     ) -> None:
         """Move the bar; look at the loss only now and then, since that waits for the device."""
+        if not trainer.is_global_zero or not step_is_whole(trainer, batch_idx):
+            return
         step, total = trainer.global_step, trainer.max_steps
         if self.progress is not None:
             task = self.progress.task_ids[0]
@@ -227,36 +159,3 @@ class StepProgress(Callback):
         error = float(metrics.get("train/pair_error", math.nan))
         rate = float(metrics.get("train/graphs_per_second", math.nan))
         return f"loss {loss:.3f}  error {error:.3f}  {rate:.1f} graphs/s"
-
-
-def _numbers(metrics: Mapping[str, Tensor], prefix: str) -> dict[str, float]:
-    chosen = {name: value for name, value in metrics.items() if name.startswith(prefix)}
-    return {name.removeprefix(prefix): float(value) for name, value in sorted(chosen.items())}
-
-
-def _append_row(path: Path, row: Mapping[str, float]) -> None:
-    is_new = not path.exists()
-    if not is_new:
-        with path.open(newline="") as stream:
-            header = next(csv.reader(stream), [])
-        if header != list(row):
-            raise LaunchError(
-                f"{path}: columns {header}, this version writes {list(row)}; move the file away"
-            )
-    with path.open("a", newline="") as stream:
-        writer = csv.DictWriter(stream, fieldnames=list(row))
-        if is_new:
-            writer.writeheader()
-        writer.writerow({name: f"{value:.9g}" for name, value in row.items()})
-
-
-def _drop_rows_after(path: Path, step: int) -> None:
-    if not path.exists():
-        return
-    with path.open(newline="") as stream:
-        reader = csv.DictReader(stream)
-        header = list(reader.fieldnames or [])
-        # A kill in the middle of a write leaves half a row, which has fewer fields.
-        rows = [row for row in reader if None not in row.values() and float(row["step"]) <= step]
-    lines = [",".join(header), *(",".join(row[name] for name in header) for row in rows)]
-    write_atomic(path, ("\n".join(lines) + "\n").encode())

@@ -32,7 +32,11 @@ class ShardData(L.LightningDataModule):
         """Build the step-indexed loader; its state goes into checkpoints."""
         trainer = self.trainer
         assert trainer is not None
-        share = DeviceShare(rank=trainer.global_rank, world_size=trainer.world_size)
+        share = DeviceShare(
+            rank=trainer.global_rank,
+            world_size=trainer.world_size,
+            accumulate=self.config.train.accumulate,
+        )
         size = self.config.model.image_size
         return build_training_loader(
             self.config.data,

@@ -3,16 +3,20 @@
 from typing import Any
 
 import lightning as L
+import torch
+from jaxtyping import Float
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor
 
 from l3r.config import RunConfig, to_plain
+from l3r.graph.diagnostics import summarise_trees
 from l3r.inference.reconstruct import reconstruct_views
 from l3r.loss.joint import JointLoss, LossTerms
 from l3r.metrics.cameras import CameraMetrics, camera_metrics, mean_metrics
 from l3r.model.light3r import Light3R
 from l3r.train.optim import build_optimizer, build_schedule
-from l3r.types import Views
+from l3r.train.run_log import DatasetMeans, gather
+from l3r.types import Prediction, Reconstruction, Views
 
 
 class TrainModule(L.LightningModule):
@@ -29,24 +33,43 @@ class TrainModule(L.LightningModule):
         self.config = config
         self.model = model
         self.loss = loss
-        self.accuracy: list[CameraMetrics] = []
+        self.accuracy: list[tuple[str, CameraMetrics]] = []
+        self.dataset_losses = DatasetMeans()
 
-    def training_step(self, batch: Views, batch_idx: int) -> Tensor:
-        """Run one optimisation step's forward pass."""
-        terms = self._compare(batch)
+    def training_step(self, batch: Views, batch_idx: int) -> dict[str, Any]:
+        """Run one optimisation step's forward pass.
+
+        Returns:
+            ``loss``, which lightning minimises, and ``graphs``, figures of each graph alone.
+        """
+        prediction, terms = self._compare(batch)
         self.log_dict(terms.scalars("train"), batch_size=len(batch.key))
-        return terms.total
+        facts = summarise_trees(prediction.tree) | self._confidence(prediction)
+        self.log_dict({f"train/{name}": torch.as_tensor(x) for name, x in facts.items()})
+        return {"loss": terms.total, "graphs": terms.graphs}
 
-    def validation_step(self, batch: Views, batch_idx: int) -> None:
-        """Log the loss of held-out graphs, and score their cameras by the full inference path."""
-        terms = self._compare(batch)
-        self.log_dict(terms.scalars("val"), batch_size=len(batch.key))
-        for scene, truth in reconstruct_views(self.model, batch, self.config.inference):
-            self.accuracy.append(camera_metrics(scene.cam_from_world, truth))
+    def validation_step(self, batch: Views, batch_idx: int) -> dict[str, Reconstruction]:
+        """Log the loss of held-out graphs, and score their cameras by the full inference path.
+
+        Returns:
+            ``scene``: the last reconstruction, for pictures.
+        """
+        _, terms = self._compare(batch)
+        self.log_dict(terms.scalars("val"), batch_size=len(batch.key), sync_dist=True)
+        self.dataset_losses.add(batch.dataset, terms.graphs)
+        pairs = reconstruct_views(self.model, batch, self.config.inference)
+        for dataset, (scene, truth) in zip(batch.dataset, pairs, strict=True):
+            self.accuracy.append((dataset, camera_metrics(scene.cam_from_world, truth)))
+        return {"scene": scene}
 
     def on_validation_epoch_end(self) -> None:
-        """Log the mean accuracy over graphs."""
-        mean = mean_metrics(self.accuracy).to_dict()
+        """Log the mean accuracy over graphs, of all and of each data set."""
+        scored = [pair for part in gather(self.accuracy) for pair in part]
+        mean = mean_metrics([metrics for _, metrics in scored]).to_dict()
+        for dataset in sorted({name for name, _ in scored}):
+            own = mean_metrics([metrics for name, metrics in scored if name == dataset])
+            mean |= {f"{dataset}/{name}": value for name, value in own.to_dict().items()}
+        mean |= self.dataset_losses.take()
         self.log_dict({f"val/{name}": value for name, value in mean.items()})
         self.accuracy.clear()
 
@@ -63,7 +86,13 @@ class TrainModule(L.LightningModule):
         """Store the whole configuration beside the weights, as builtins."""
         checkpoint["l3r_config"] = to_plain(self.config)
 
-    def _compare(self, batch: Views) -> LossTerms:
-        prediction = self.model(batch.image, batch.true_shape, batch.scores)
+    def _compare(self, batch: Views) -> tuple[Prediction, LossTerms]:
+        prediction: Prediction = self.model(batch.image, batch.true_shape, batch.scores)
         terms: LossTerms = self.loss(prediction, batch)
-        return terms
+        return prediction, terms
+
+    def _confidence(self, prediction: Prediction) -> dict[str, Float[Tensor, ""]]:
+        """Mean log-confidence, and the share of points that inference would trust."""
+        log_conf = prediction.world.log_conf.detach().float()
+        trusted = log_conf.exp() > self.config.inference.min_conf
+        return {"log_conf": log_conf.mean(), "confident": trusted.float().mean()}

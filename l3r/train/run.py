@@ -1,25 +1,36 @@
 """One training run: parse nothing, build, fit, write."""
 
 import logging
+import signal
 import sys
 import warnings
 from pathlib import Path
 
 import lightning as L
 import torch
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.callbacks import Callback
 
 from l3r.config import RunConfig, to_yaml
-from l3r.errors import ConfigError
+from l3r.errors import CheckpointError, ConfigError
 from l3r.files import write_atomic
 from l3r.inference.checkpoint import write_model
 from l3r.inference.weights import initialise
 from l3r.loss.joint import JointLoss
 from l3r.model.light3r import Light3R
-from l3r.train.callbacks import CsvLog, GradientGuard, StepProgress, StepTimer
-from l3r.train.checkpointing import AtomicCheckpointIO, find_resume
+from l3r.train.callbacks import RoomGradients, StepProgress, StepTimer
+from l3r.train.checkpointing import (
+    CheckpointFiles,
+    StepCheckpoint,
+    clear_leftovers,
+    find_resume,
+)
 from l3r.train.datamodule import ShardData
+from l3r.train.guard import GradientGuard, StepMean
 from l3r.train.module import TrainModule
+from l3r.train.ranks import Agreement, Ranks, explain_failure, find_ranks
+from l3r.train.run_log import RunLog
+from l3r.train.signals import StopSignals
+from l3r.train.sinks import Sink, build_sinks
 
 
 def train(config: RunConfig) -> Path:
@@ -27,68 +38,109 @@ def train(config: RunConfig) -> Path:
 
     Writes in ``train.output_dir``: ``config.yaml``, ``metrics.csv``, ``validation.csv``,
     ``last.ckpt`` every ``checkpoint_every`` steps and ``model.ckpt``, weights alone, at the end.
+    Of several processes, the first one writes.
 
     Returns:
         Path of ``model.ckpt``.
 
     Raises:
-        CheckpointError: ``init`` cannot be read or does not fit; nothing is written then.
-        ConfigError: No data, or ``output_dir`` holds another run.
+        CheckpointError: ``init`` cannot be read or does not fit; nothing is written then. Or the
+            end cannot be saved.
+        ConfigError: No data, ``output_dir`` holds another run, or a package of ``logs.to`` is
+            missing.
         DataError: The shards cannot be read.
-        LaunchError: Too many bad steps in a row.
+        LaunchError: Too many bad steps in a row, another process was lost, or a signal came; the
+            same call goes on.
     """
     if config.train.accelerator == "gpu" and not torch.cuda.is_available():
         raise ConfigError("train.accelerator is gpu and torch finds none; use auto or cpu")
+    ranks = find_ranks(config)
     folder = Path(config.train.output_dir)
     last = folder / "last.ckpt"
+    sinks = build_sinks(config, folder) if ranks.is_first else []
     resume_from = find_resume(last, config)
-    torch.manual_seed(config.train.seed)
-    model = Light3R(config.model, config.graph)
-    if config.train.init and resume_from is None:
-        sys.stderr.write(initialise(model, Path(config.train.init)))
-    folder.mkdir(parents=True, exist_ok=True)
-    write_atomic(folder / "config.yaml", to_yaml(config).encode())
-    model.recompute_activations(enabled=config.train.gradient_checkpointing)
-    if config.train.compile:
-        model.compile_blocks()
+    model = _build_model(config, ranks, is_fresh=resume_from is None)
+    if ranks.is_first:
+        folder.mkdir(parents=True, exist_ok=True)
+        clear_leftovers(last)
+        write_atomic(folder / "config.yaml", to_yaml(config).encode())
     module = TrainModule(config, model, JointLoss(config.loss))
     _quieten_lightning()
-    trainer = _build_trainer(config, folder)
-    trainer.fit(module, datamodule=ShardData(config), ckpt_path=resume_from, weights_only=True)
-    trainer.save_checkpoint(last)
-    write_model(folder / "model.ckpt", model, config)
+    files = CheckpointFiles(config.train.accumulate)
+    with StopSignals() as signals:
+        callbacks = _build_callbacks(config, signals, sinks)
+        trainer = _build_trainer(config, ranks, callbacks, files)
+        try:
+            trainer.fit(
+                module, datamodule=ShardData(config), ckpt_path=resume_from, weights_only=True
+            )
+            trainer.save_checkpoint(last)
+        except RuntimeError as error:
+            explained = explain_failure(error, ranks, config.train)
+            if explained is None:
+                raise
+            if trainer.strategy.launcher is not None:
+                # Those that this process started, and that may hang; srun ends its own.
+                trainer.strategy.launcher.kill(signal.SIGKILL)
+            raise explained from error
+    if files.problem:
+        raise CheckpointError(f"{last}: the end cannot be saved ({files.problem}); make room")
+    if ranks.is_first:
+        write_model(folder / "model.ckpt", model, config)
     return folder / "model.ckpt"
 
 
-def _build_trainer(config: RunConfig, folder: Path) -> L.Trainer:
+def _build_model(config: RunConfig, ranks: Ranks, *, is_fresh: bool) -> Light3R:
+    torch.manual_seed(config.train.seed)
+    model = Light3R(config.model, config.graph)
+    if config.train.init and is_fresh:
+        told = initialise(model, Path(config.train.init))
+        if ranks.is_first:
+            sys.stderr.write(told)
+    model.recompute_activations(enabled=config.train.gradient_checkpointing)
+    if config.train.compile:
+        model.compile_blocks()
+    return model
+
+
+def _build_callbacks(config: RunConfig, signals: StopSignals, sinks: list[Sink]) -> list[Callback]:
     train = config.train
-    checkpoint = ModelCheckpoint(
-        dirpath=folder,
-        filename="last",
-        every_n_train_steps=train.checkpoint_every,
-        enable_version_counter=False,
-    )
+    folder = Path(train.output_dir)
+    agreement = Agreement()
+    callbacks: list[Callback] = [
+        RoomGradients(train.log_every),
+        StepMean(),
+        GradientGuard(folder / "bad_steps.jsonl", train.max_bad_steps, agreement),
+        StepTimer(),
+        # On all processes, which give it their figures; the first one writes.
+        RunLog(folder, train.log_every, sinks, pictures=config.logs.pictures),
+        StepProgress(),
+    ]
+    return [*callbacks, StepCheckpoint(folder / "last.ckpt", config, signals, agreement)]
+
+
+def _build_trainer(
+    config: RunConfig, ranks: Ranks, callbacks: list[Callback], files: CheckpointFiles
+) -> L.Trainer:
+    train = config.train
     return L.Trainer(
         accelerator=train.accelerator,
         precision="bf16-mixed" if train.precision == "bf16" else "32-true",
-        devices=1,
+        devices=ranks.devices,
+        num_nodes=ranks.num_nodes,
+        strategy=ranks.strategy(train),
         max_steps=train.max_steps,
         max_epochs=-1,
+        accumulate_grad_batches=train.accumulate,
         # An integer limit keeps lightning from fetching a batch too many, which a resumed run
         # would miss; one epoch is the whole run, so that workers start once.
-        limit_train_batches=train.max_steps,
-        val_check_interval=train.validate_every,
+        limit_train_batches=train.max_steps * train.accumulate,
+        val_check_interval=train.validate_every * train.accumulate,
         check_val_every_n_epoch=None,
         num_sanity_val_steps=0,
         gradient_clip_val=train.clip_norm,
-        callbacks=[
-            checkpoint,
-            GradientGuard(folder / "bad_steps.jsonl", train.max_bad_steps),
-            StepTimer(),
-            CsvLog(folder, train.log_every),
-            StepProgress(),
-        ],
-        plugins=[AtomicCheckpointIO()],
+        callbacks=callbacks,
+        plugins=[files, ranks.environment()],
         logger=False,
         enable_progress_bar=False,
         enable_model_summary=False,
@@ -99,5 +151,6 @@ def _build_trainer(config: RunConfig, folder: Path) -> L.Trainer:
 
 def _quieten_lightning() -> None:
     """Keep lightning's advertisements and its advice on other loaders out of the terminal."""
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", module="lightning.*")

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from omegaconf import OmegaConf
 
 from l3r.config import RunConfig, from_plain, load_config, override_config, to_plain, to_yaml
 from l3r.errors import ConfigError
@@ -16,7 +17,27 @@ FILES = sorted(CONFIGS.rglob("*.yaml"))
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(CONFIGS)))
 def test_every_shipped_file_loads_on_the_base(path):
-    assert isinstance(load_config([BASE, str(path)]), RunConfig)
+    sources = OmegaConf.load(path).get("data", {}).get("sources", {})
+    folders = [f"data.sources.{name}.shards=folder" for name in sources]
+    assert isinstance(load_config([BASE, str(path), *folders]), RunConfig)
+
+
+@pytest.mark.parametrize(("size", "gpus"), [("512", 8), ("224", 16)])
+def test_the_trainings_of_the_paper_want_shards_and_spread_over_its_gpus(size, gpus):
+    files = [
+        BASE,
+        str(CONFIGS / f"model/l3r_{size}.yaml"),
+        str(CONFIGS / f"train/paper_{size}.yaml"),
+    ]
+    with pytest.raises(ConfigError, match=r"no value for data\.sources\.co3d\.shards"):
+        load_config(files)
+    names = ("waymo", "co3d", "megadepth", "tartanair")
+    config = load_config([*files, *[f"data.sources.{name}.shards={name}" for name in names]])
+    assert [source.weight for source in config.data.sources.values()] == [1] * 4
+    assert config.train.devices * config.train.num_nodes == gpus
+    assert config.data.graphs_per_step / gpus == (1 if size == "512" else 2)
+    assert (config.data.num_views, config.train.max_steps) == (8, 100_000)
+    assert len(config.data.image_sizes) == (5 if size == "512" else 0)
 
 
 @pytest.mark.parametrize(

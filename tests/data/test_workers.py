@@ -29,7 +29,7 @@ def test_a_dead_process_ends_the_run_in_one_line_where_batches_are_asked_for(fol
     batches = iter(loader)
     next(batches)
     (worker,) = set(multiprocessing.active_children()) - others
-    for meant_for_the_run in (signal.SIGINT, signal.SIGUSR1, signal.SIGUSR2):
+    for meant_for_the_run in (signal.SIGINT, signal.SIGUSR1, signal.SIGUSR2, signal.SIGTERM):
         os.kill(worker.pid, meant_for_the_run)
     for _ in range(5):
         next(batches)

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from l3r.export.durations import format_seconds
 from l3r.export.plan import draw_plan, edge_steps, top_axes
-from l3r.export.report import MAX_IMAGES, format_seconds, render_report
+from l3r.export.report import MAX_IMAGES, render_report
 from l3r.export.run_json import RunRecord
 from l3r.export.thumbnails import confidence_picture, depth_picture, photo_picture
 

@@ -1,7 +1,7 @@
 import torch
 
 from l3r.config import GraphConfig
-from l3r.graph.diagnostics import diagnose_tree, split_components
+from l3r.graph.diagnostics import diagnose_tree, split_components, summarise_trees
 from l3r.graph.trees import build_tree
 from tests.graph.scenes import random_scores
 
@@ -61,3 +61,12 @@ def test_a_large_residual_cuts_too():
     config = GraphConfig(max_residual=0.5)
     component = split_components(tree, scores, torch.tensor([0.0, 0.9, 0.1]), config)
     assert component.tolist() == [0, 0, 1, 0]
+
+
+def test_a_batch_of_stars_and_chains_is_told_apart():
+    chain = torch.eye(5, dtype=torch.float64)
+    for view in range(4):
+        chain[view, view + 1] = chain[view + 1, view] = 0.9
+    both = torch.stack([chain, star(5)[1]])
+    found = summarise_trees(build_tree(both, GraphConfig()))
+    assert found == {"root_degree": 3.0, "root_degree_max": 4.0, "tree_depth": 2.0}

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from l3r.config import LossConfig
 from l3r.loss.confidence import confidence_loss, point_error
 from l3r.loss.joint import JointLoss
-from l3r.loss.reduction import mean_over_pixels
+from l3r.loss.reduction import mean_of_each_graph, mean_over_pixels
 from l3r.loss.scale import scale_factors
 from l3r.loss.targets import build_targets
 from l3r.types import PairPointmaps
@@ -216,6 +216,18 @@ def test_pieces_by_hand():
     assert float(mean_over_pixels(values, counted, "per_graph")) == (2 + 9) / 2
     assert float(mean_over_pixels(values, counted, "pooled")) == 15 / 4
     assert float(mean_over_pixels(values * 0, counted & False, "per_graph")) == 0
+    assert mean_of_each_graph(values, counted).tolist() == [2, 9]
+
+
+@few
+@given(SEEDS)
+def test_the_loss_is_the_mean_of_the_losses_of_its_graphs(seed):
+    views = random_views(seed, metric=True)
+    terms = loss_of(noisy_prediction(views, seed), views)
+    assert len(terms.graphs["loss"]) == len(views.key) > 1
+    assert float(terms.graphs["loss"].mean()) == pytest.approx(float(terms.total), rel=1e-9)
+    error = terms.parts["pair_error"]
+    assert float(terms.graphs["pair_error"].mean()) == pytest.approx(float(error), rel=1e-9)
 
 
 def test_targets_of_an_edge_are_in_the_parents_frame():

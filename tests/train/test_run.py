@@ -6,12 +6,15 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import pytest
 import torch
 
 import l3r
+from l3r.cli.main import main
 from l3r.config import from_plain, load_config
 from l3r.errors import CheckpointError, ConfigError, LaunchError
+from l3r.export.graph_sheet import CELL
 from l3r.inference.checkpoint import load_model_and_config, read_checkpoint
 from l3r.loss.joint import JointLoss
 from l3r.train.run import train
@@ -48,6 +51,14 @@ def test_a_run_leaves_its_log_its_configuration_and_its_weights(finished, hand_s
         "grad_norm",
         "graphs_per_second",
         "data_wait",
+        *(f"grad_norm_{room}" for room in ("encoder", "alignment", "decoder", "heads")),
+        "log_conf",
+        "confident",
+        "root_degree",
+        "root_degree_max",
+        "tree_depth",
+        "hand/loss",
+        "hand/pair_error",
     }
     assert set(rows[0]) == expected
     validation = read_log(finished, "validation.csv")
@@ -57,6 +68,26 @@ def test_a_run_leaves_its_log_its_configuration_and_its_weights(finished, hand_s
     assert config == load_config(layers(hand_shards, finished, max_steps=12))
     assert not model.training
     assert load_config([str(finished / "config.yaml")]) == config
+
+
+def test_each_validation_draws_its_first_graph(finished):
+    names = ["step_000005.png", "step_000010.png"]
+    assert sorted(path.name for path in (finished / "pictures").iterdir()) == names
+    sheet = cv2.imread(str(finished / "pictures" / names[1]))
+    assert sheet.shape == (4 * (CELL + 4), 76 + 3 * (CELL + 4), 3)
+
+
+def test_a_finished_run_has_a_report_with_its_pictures(finished, tmp_path, capsys):
+    page = tmp_path / "page.html"
+    assert main(["report", str(finished), "--out", str(page)]) == 0
+    assert capsys.readouterr().out.startswith("finished: step 12 of 12")
+    text = page.read_text()
+    assert all(f"<h3>Step {step}</h3>" in text for step in (5, 10))
+    assert f"threads</td><td>{torch.get_num_threads()}" in text
+    # All that was logged can be drawn: no file is missing or damaged.
+    assert "Missing or damaged" not in text
+    for title in ("RRA", "Norm of the gradient", "Trees", "Mean log-confidence"):
+        assert title in text
 
 
 def test_checkpoints_read_without_pickles_and_carry_the_configuration(finished):
@@ -122,12 +153,16 @@ def test_a_run_may_move_with_its_shards(hand_shards, finished, tmp_path):
     assert losses(tmp_path / "b") == losses(finished)
 
 
-def test_a_log_of_other_columns_is_not_mixed(hand_shards, tmp_path):
+def test_a_run_of_an_older_version_goes_on_with_more_columns(hand_shards, tmp_path):
     train(load_config(layers(hand_shards, tmp_path, max_steps=5)))
     log = tmp_path / "metrics.csv"
     log.write_text(log.read_text().replace("pair_error", "old_error"))
-    with pytest.raises(LaunchError, match="move the file away"):
-        train(load_config(layers(hand_shards, tmp_path, max_steps=6)))
+    train(load_config(layers(hand_shards, tmp_path, max_steps=6)))
+    rows = read_log(tmp_path)
+    assert len(rows) == 6
+    assert rows[4]["old_error"]
+    assert rows[4]["pair_error"] == "" != rows[5]["pair_error"]
+    assert rows[5]["old_error"] == ""
 
 
 def test_a_gpu_that_is_not_there_is_a_clear_error(hand_shards, tmp_path, monkeypatch):

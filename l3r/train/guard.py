@@ -1,0 +1,104 @@
+"""What a step amounts to, over its batches and processes, and whether it counts."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import Callback
+from torch import Tensor, nn
+from torch.nn.utils import get_total_norm
+
+from l3r.errors import LaunchError
+from l3r.loss.joint import LossTerms
+from l3r.train.ranks import Agreement
+from l3r.types import Views
+
+
+class StepMean(Callback):
+    """Logs the loss and its terms as means over all graphs of a step.
+
+    Lightning would log those of the first process's last batch.
+    """
+
+    def __init__(self) -> None:
+        self.batches: list[dict[str, Tensor]] = []
+
+    def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Listen to what the loss gives in training."""
+        loss = pl_module.get_submodule("loss")
+        loss.register_forward_hook(self._collect)
+
+    def on_before_optimizer_step(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: torch.optim.Optimizer
+    ) -> None:
+        """Log the means, under the names of the module's own figures."""
+        names = list(self.batches[0])
+        rows = torch.stack([torch.stack([row[name] for name in names]) for row in self.batches])
+        means = trainer.strategy.reduce(rows.mean(dim=0), reduce_op="mean")
+        pl_module.log_dict(dict(zip(names, means, strict=True)))
+        self.batches.clear()
+
+    def _collect(self, loss: nn.Module, inputs: Any, terms: LossTerms) -> None:
+        if loss.training:
+            self.batches.append(terms.scalars("train"))
+
+
+class GradientGuard(Callback):
+    """Skips a step whose loss or gradient is not finite, on all processes alike.
+
+    The keys of the step's graphs, those of all processes, are added to ``bad_steps.jsonl``. Also
+    measures the gradient's norm, as ``train/grad_norm``. Stands behind :class:`StepMean`.
+
+    Args:
+        path: Where bad steps are written down.
+        max_bad_steps: Training stops after so many in a row.
+        agreement: With the other processes.
+    """
+
+    def __init__(self, path: Path, max_bad_steps: int, agreement: Agreement) -> None:
+        self.path = path
+        self.max_bad_steps = max_bad_steps
+        self.agreement = agreement
+        self.bad_in_a_row = 0
+        self.keys: list[str] = []
+
+    def on_train_batch_start(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Views, batch_idx: int
+    ) -> None:
+        """Remember which graphs the step is made of."""
+        if batch_idx % trainer.accumulate_grad_batches == 0:
+            self.keys = []
+        self.keys += batch.key
+
+    def on_before_optimizer_step(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: torch.optim.Optimizer
+    ) -> None:
+        """Drop the gradients of a bad step: the optimiser leaves parameters without one alone."""
+        parameters = [p for p in pl_module.parameters() if p.grad is not None]
+        norm = get_total_norm([p.grad for p in parameters if p.grad is not None])
+        pl_module.log("train/grad_norm", norm)
+        loss = trainer.callback_metrics.get("train/loss", norm)
+        is_bad = not bool(torch.isfinite(norm) & torch.isfinite(loss))
+        if not self.agreement.any([is_bad])[0]:
+            self.bad_in_a_row = 0
+            return
+        for parameter in parameters:
+            parameter.grad = None
+        keys = [key for part in self.agreement.gather(self.keys) for key in part]
+        row = {"step": trainer.global_step, "loss": str(float(loss)), "grad_norm": str(float(norm))}
+        if trainer.is_global_zero:
+            with self.path.open("a") as stream:
+                stream.write(json.dumps({**row, "keys": keys}) + "\n")
+        self._count(row)
+
+    def _count(self, row: dict[str, Any]) -> None:
+        self.bad_in_a_row += 1
+        if self.bad_in_a_row >= self.max_bad_steps:
+            raise LaunchError(
+                f"step {row['step']}: loss {row['loss']}, gradient norm {row['grad_norm']}; "
+                f"{self.bad_in_a_row} such steps in a row, fewer than "
+                f"train.max_bad_steps={self.max_bad_steps} expected; their graphs are listed in "
+                f"{self.path}"
+            )

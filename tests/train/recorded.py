@@ -1,0 +1,42 @@
+"""``l3r train`` that writes down what each process sees, and spoils or ends what a test names.
+
+Run it as ``python -m tests.train.recorded LAYERS``. In the environment: ``RECORD`` is a folder;
+``NAN_AT=STEP:RANK`` makes the loss of a step not finite in one process; ``DIE_AT`` kills the
+process there, ``HANG_AT`` stops it.
+"""
+
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import torch
+
+from l3r.cli.main import main
+from l3r.train.module import TrainModule
+
+_step = TrainModule.training_step
+
+
+def training_step(self, batch, batch_idx):
+    loss = _step(self, batch, batch_idx)
+    step, rank = self.trainer.global_step + 1, self.trainer.global_rank
+    if folder := os.environ.get("RECORD"):
+        row = {"step": step, "keys": batch.key, "size": list(batch.image.shape)}
+        with (Path(folder) / f"{rank}.jsonl").open("a") as stream:
+            stream.write(json.dumps(row) + "\n")
+    here = f"{step}:{rank}"
+    if os.environ.get("DIE_AT") == here:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if os.environ.get("HANG_AT") == here:
+        time.sleep(600)
+    # After the loss was computed: its gradient is what must not reach the weights.
+    return loss * torch.nan if os.environ.get("NAN_AT") == here else loss
+
+
+TrainModule.training_step = training_step
+
+if __name__ == "__main__":
+    sys.exit(main(["train", *sys.argv[1:]]))
