@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from l3r.data import schema
+from l3r.data.schema.headers import depth_pixels, jpeg_size
 from l3r.errors import DataError
 from tests.data.graphs import make_graph, write_folder
 
@@ -155,3 +156,10 @@ def test_a_member_that_is_no_file_is_refused():
         tar.addfile(link)
     with pytest.raises(DataError, match=r"here: found member 'toy-0\.json', expected files"):
         schema.members_from_bytes(stream.getvalue(), "here", "toy-0")
+
+
+def test_headers_are_read_as_they_were_written(members):
+    assert jpeg_size(members[PHOTO]) == (8, 16)
+    assert jpeg_size(members[PHOTO][:20]) is None
+    np.testing.assert_array_equal(depth_pixels(members[DEPTH], (8, 16)), np.ones((8, 16)))
+    assert depth_pixels(members[DEPTH], (16, 8)) is None
