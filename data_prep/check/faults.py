@@ -13,6 +13,7 @@ KINDS = {
     "wrong_checksum": "a tar has another SHA-256 than the manifest says",
     "unreadable_tar": "a file is no whole tar",
     "wrong_graph_count": "a tar holds another number of graphs than the manifest says",
+    "wrong_index": "the index beside a tar is missing, or says other than the tar's headers",
     "unreadable_graph": "the bytes of a graph cannot be read out of its tar",
     "missing_member": "a graph lacks one of its files",
     "bad_meta": "a graph's JSON cannot be used",

@@ -20,6 +20,8 @@ from l3r.errors import DataError
 _DAMAGE = b"Corrupt JPEG data"
 """How libjpeg's warnings begin; it fills what it cannot read and goes on."""
 _BY_SUFFIX = {"json": "bad_meta", "jpg": "bad_image", "npy": "bad_depth"}
+_NO_META = (KeyError, TypeError, ValueError, OverflowError, RecursionError)
+"""What reading numbers out of any bytes raises."""
 
 _T = TypeVar("_T")
 
@@ -66,8 +68,8 @@ def _error(stored: StoredGraph, kind: str, detail: str) -> GraphError:
 def _count_images(members: Mapping[str, Any]) -> int:
     """Count the images a graph should hold: by its JSON, since files may be missing."""
     try:
-        return len(json.loads(members["json"])["file"])
-    except (KeyError, TypeError, ValueError):
+        return max(1, len(json.loads(members["json"])["file"]))
+    except _NO_META:
         return 1  # decoding says what is wrong
 
 
@@ -90,7 +92,7 @@ def _find_camera_problem(data: bytes) -> tuple[str, str] | None:
         check_cameras(K, cam_from_world, "json")
     except DataError as error:
         return "bad_camera", str(error)
-    except (KeyError, TypeError, ValueError):
+    except _NO_META:
         return None
     return None
 

@@ -6,11 +6,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from data_prep.check.faults import Fault
-from l3r.data.schema import IndexEntry, Manifest, ShardEntry, load_index, read_manifest
+from l3r.data.schema import (
+    IndexEntry,
+    Manifest,
+    ShardEntry,
+    ShardIndex,
+    index_path,
+    index_shard,
+    load_index,
+    read_index,
+    read_manifest,
+)
 from l3r.errors import DataError
 
 _PARTS = ("train", "val")
 _REBUILD = "remove it and run the same l3r-prep build again, or copy it anew"
+_COPY_INDEX = "copy it anew, or remove it and the tar and run the same l3r-prep build again"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +46,7 @@ class Tars:
     graphs: list[StoredGraph] = field(default_factory=list)
     """Graphs of sound tars, in stored order."""
     faults: list[Fault] = field(default_factory=list)
-    """One for each tar that is not as the manifest says."""
+    """One for each tar that is not as the manifest or its index says."""
     num_lost: int = 0
     """Graphs that the manifest counts in those tars."""
 
@@ -70,8 +81,11 @@ def check_tars(folder: Path, manifest: Manifest, *, digests: bool) -> Iterator[T
         except _TarError as error:
             fault = Fault(kind=error.kind, shard=shard.name, key="", detail=str(error))
             yield Tars(faults=[fault], num_lost=shard.num_graphs)
-        else:
-            yield Tars(graphs=index)
+            continue
+        graphs = [StoredGraph(shard=folder / shard.name, entry=entry) for entry in index.graphs]
+        problem = _find_index_problem(folder / shard.name, index)
+        faults = [Fault(kind="wrong_index", shard=shard.name, key="", detail=problem)]
+        yield Tars(graphs=graphs, faults=faults if problem else [])
 
 
 def list_graphs(folder: Path) -> list[StoredGraph]:
@@ -95,7 +109,7 @@ class _TarError(DataError):
         self.kind = kind
 
 
-def _open_tar(path: Path, shard: ShardEntry, *, digests: bool) -> list[StoredGraph]:
+def _open_tar(path: Path, shard: ShardEntry, *, digests: bool) -> ShardIndex:
     if not path.is_file():
         raise _TarError(
             "missing_tar",
@@ -108,13 +122,24 @@ def _open_tar(path: Path, shard: ShardEntry, *, digests: bool) -> list[StoredGra
     if digests:
         _compare_digest(path, shard)
     try:
-        graphs = load_index(path).graphs
+        index = index_shard(path)  # its headers, whatever the index beside it says
     except DataError as error:
         raise _TarError("unreadable_tar", str(error)) from error
-    if len(graphs) != shard.num_graphs:
-        detail = f"{len(graphs)} graphs, the manifest says {shard.num_graphs}; {_REBUILD}"
+    if len(index.graphs) != shard.num_graphs:
+        detail = f"{len(index.graphs)} graphs, the manifest says {shard.num_graphs}; {_REBUILD}"
         raise _TarError("wrong_graph_count", detail)
-    return [StoredGraph(shard=path, entry=entry) for entry in graphs]
+    return index
+
+
+def _find_index_problem(path: Path, scanned: ShardIndex) -> str:
+    """Say what is wrong with the index beside a tar; readers over HTTP know only that."""
+    try:
+        index = read_index(path)
+    except DataError as error:
+        return str(error).partition("; delete")[0] + f"; {_COPY_INDEX}"
+    if index != scanned:
+        return f"{index_path(path).name} says other than the tar's headers; {_COPY_INDEX}"
+    return ""
 
 
 def _compare_digest(path: Path, shard: ShardEntry) -> None:

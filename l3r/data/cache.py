@@ -147,7 +147,7 @@ class CachedStore(ShardStore):
         data = self.cache.read(name)
         if data is None:
             data = self.store.read_graph(shard, entry)
-            members_from_bytes(data, f"{self.place}/{shard.name}:{entry.key}")
+            members_from_bytes(data, f"{self.place}/{shard.name}:{entry.key}", entry.key)
             self.cache.write(name, data)
         return data
 

@@ -1,13 +1,23 @@
 """Shards on a web server or an object store, read by HTTP ranges."""
 
+import re
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote
 from urllib.request import getproxies, proxy_bypass
 
 from urllib3 import BaseHTTPResponse, PoolManager, ProxyManager, Retry, Timeout
-from urllib3.exceptions import HTTPError, MaxRetryError, ProtocolError
+from urllib3.exceptions import (
+    ConnectTimeoutError,
+    HTTPError,
+    MaxRetryError,
+    NewConnectionError,
+    ProtocolError,
+    ProxyError,
+    ReadTimeoutError,
+)
 from urllib3.util import parse_url
 
 from l3r.data.schema import (
@@ -20,16 +30,22 @@ from l3r.data.schema import (
     parse_index,
     parse_manifest,
 )
-from l3r.data.store import ShardStore
+from l3r.data.store import ShardStore, UnreachableError
 from l3r.errors import DataError
 
 PAUSES = (0.2, 0.5, 1.0, 2.0, 4.0)
 """Seconds between attempts."""
 MAX_CONNECTIONS = 16
 """Open connections of one process; one thread uses one."""
+MAX_FILE_BYTES = 256 * 2**20
+"""Largest manifest or index that is read."""
+MAX_SECONDS = 300.0
+"""After so long no attempt begins and no body is read on."""
 
 _PASSING = (408, 425, 429, 500, 502, 503, 504)
 """Answers that may be another a moment later."""
+_SILENCE = (NewConnectionError, ConnectTimeoutError, ReadTimeoutError, ProxyError)
+_RANGE = re.compile(r"bytes[ =](\d{1,18})-(\d{1,18})/")
 _TIMEOUT = Timeout(connect=10, read=60)
 _REDIRECTS_ONLY = Retry(total=None, connect=0, read=0, status=0, other=0, redirect=5)
 
@@ -40,6 +56,10 @@ class HttpStore(ShardStore):
     A graph is one request for a range. Connections are kept; what may pass (no connection, a
     broken one, an answer of 5xx or 429) is tried again after growing pauses. Proxies of the
     environment are used.
+
+    Without redirects, no graph takes longer than ``MAX_SECONDS``, the 10 s to connect and 60 s of
+    silence that the last attempt may add, and a pause: 374 s. No more
+    bytes are read than were asked for, and one.
 
     Args:
         url: Address of the folder.
@@ -113,35 +133,38 @@ class HttpStore(ShardStore):
         """Get a file, or its bytes from the first to the last of a span.
 
         Raises:
-            DataError: The server refuses it, or does not answer after all attempts.
+            UnreachableError: No attempt met a server that answers.
+            DataError: The server refuses it, or fails in all attempts.
         """
-        problem = ""
+        deadline = time.monotonic() + MAX_SECONDS
+        problem, attempts, is_silent = "", 0, True
         for pause in (0.0, *PAUSES):
             time.sleep(pause)
+            if attempts and time.monotonic() > deadline:
+                break
+            attempts += 1
             try:
-                return self._try(url, where, hint, span)
-            except MaxRetryError as error:
-                problem = str(error.reason or error)
+                return self._try(_Request(url, where, hint, span, deadline))
             except HTTPError as error:
-                problem = str(error)
-        raise DataError(
-            f"{where}: {problem}, {1 + len(PAUSES)} times in a row; look after the server and the"
-            " network"
-        )
+                reason = error.reason if isinstance(error, MaxRetryError) else error
+                problem = str(reason or error)
+                is_silent = is_silent and isinstance(reason, _SILENCE)
+        message = f"{where}: {problem}, {attempts} times in a row; look after the server and the"
+        raise (UnreachableError if is_silent else DataError)(f"{message} network")
 
-    def _try(self, url: str, where: str, hint: str, span: tuple[int, int] | None) -> bytes:
-        headers = {} if span is None else {"Range": f"bytes={span[0]}-{span[1]}"}
+    def _try(self, request: "_Request") -> bytes:
+        span = request.span
         response = self._connections().request(
             "GET",
-            url,
-            headers=headers,
+            request.url,
+            headers={} if span is None else {"Range": f"bytes={span[0]}-{span[1]}"},
             timeout=_TIMEOUT,
             retries=_REDIRECTS_ONLY,
             preload_content=False,  # a server without ranges would send the whole tar
         )
         try:
-            _check(response, where, hint, span)
-            data = response.read()
+            _check(response, request)
+            data = _read(response, request)
         except BaseException:
             response.close()  # what is left of the answer is not wanted
             raise
@@ -158,29 +181,86 @@ class HttpStore(ShardStore):
         return self._pool
 
 
-def _check(response: BaseHTTPResponse, where: str, hint: str, span: tuple[int, int] | None) -> None:
+@dataclass(frozen=True)
+class _Request:
+    """One thing to fetch."""
+
+    url: str
+    where: str
+    hint: str
+    span: tuple[int, int] | None
+    """First and last byte; None: the whole file."""
+    deadline: float
+    """Of ``time.monotonic``."""
+
+    @property
+    def max_bytes(self) -> int:
+        return MAX_FILE_BYTES if self.span is None else self.span[1] - self.span[0] + 1
+
+
+def _read(response: BaseHTTPResponse, request: _Request) -> bytes:
+    """Read a body, at most one byte more than it may have.
+
+    Raises:
+        ProtocolError: It comes too slowly.
+        DataError: It is too long.
+    """
+    data = bytearray()
+    while len(data) <= request.max_bytes:
+        if time.monotonic() > request.deadline:
+            raise ProtocolError(f"{len(data)} bytes in {MAX_SECONDS:.0f} s")
+        # One read of the socket each, so that a trickle meets the deadline too.
+        piece = response.read1(request.max_bytes + 1 - len(data))
+        if not piece:
+            return bytes(data)
+        data += piece
+    raise _flooded(request)
+
+
+def _flooded(request: _Request) -> DataError:
+    return DataError(
+        f"{request.where}: the server sends more than was asked, expected {request.max_bytes} bytes"
+        f" or less; {request.hint}"
+    )
+
+
+def _check(response: BaseHTTPResponse, request: _Request) -> None:
     """Look at an answer before its body is read.
 
     Raises:
         ProtocolError: Another attempt may go well.
         DataError: It will not.
     """
+    where, span = request.where, request.span
     status = f"the server answers {response.status} {response.reason or ''}".rstrip()
     if response.status in _PASSING:
         raise ProtocolError(status)
-    if span is None and response.status == 200:
-        return
     if span is not None and response.status == 200:
         raise DataError(
             f"{where}: the server sends the whole tar, expected the range that was asked for;"
             " take a server that knows ranges (nginx, S3 and most others), or copy the shards to a"
             " disk"
         )
-    if span is None or response.status != 206:
-        raise DataError(f"{where}: {status}; {hint}")
-    found = response.headers.get("Content-Range", "")
-    if not found.replace("=", " ").startswith(f"bytes {span[0]}-"):
+    if response.status != (200 if span is None else 206):
+        raise DataError(f"{where}: {status}; {request.hint}")
+    length = response.headers.get("Content-Length", "")
+    if length.isdigit() and int(length[:18]) > request.max_bytes:
+        raise _flooded(request)
+    if span is not None:
+        _check_span(response.headers.get("Content-Range", ""), length, span, where)
+
+
+def _check_span(found: str, length: str, span: tuple[int, int], where: str) -> None:
+    """Compare what is sent with what was asked; a tar that ends before is told by its length.
+
+    Raises:
+        DataError: It is another range, or its length is not that of the range.
+    """
+    match = _RANGE.match(found)
+    first, last = (int(match[1]), int(match[2])) if match else (-1, -1)
+    is_length = not length or length == str(last - first + 1)
+    if first != span[0] or not first <= last <= span[1] or not is_length:
         raise DataError(
-            f"{where}: the server sends '{found}', expected bytes {span[0]}-{span[1]}; take"
-            " another server, or copy the shards to a disk"
+            f"{where}: the server sends '{found:.80}' of {length or 'unknown'} bytes, expected"
+            f" bytes {span[0]}-{span[1]}; take another server, or copy the shards to a disk"
         )

@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader, Dataset
 from l3r.config import DataConfig
 from l3r.data.sampling import SampleChooser, Variation
 from l3r.data.source import open_folders
-from l3r.data.steps import MAX_ATTEMPTS, DeviceShare, StepDataset
+from l3r.data.steps import DeviceShare, StepDataset
 from l3r.errors import ConfigError, DataError, LaunchError
 from l3r.types import Views
 
@@ -104,7 +104,7 @@ class StepLoader:
             views = batch.unpack()
             if views is None:
                 raise DataError(
-                    f"{MAX_ATTEMPTS} graphs in a row cannot be read; last: {batch.skipped[-1]}; "
+                    f"no graph can be read; last: {batch.skipped[-1]}; "
                     "check that the shards are there, and run 'l3r-prep check' on them"
                 )
             guard.count(len(views.key), batch.skipped)

@@ -71,7 +71,7 @@ class ShardFolder:
         key = self._keys[index].decode()
         entry = IndexEntry(key=key, offset=offset, size=size, num_views=num_views)
         data = self.store.read_graph(self.shards[number], entry)
-        members = members_from_bytes(data, self.key(index))
+        members = members_from_bytes(data, self.key(index), key)
         return KeyedGraph(key=self.key(index), graph=decode_graph(members, self.num_views))
 
 

@@ -10,6 +10,7 @@ from l3r.data.color import ColorChange
 from l3r.data.sampling import SampleChooser, Variation
 from l3r.data.source import ShardFolder
 from l3r.data.stages import KeyedGraph, PackedViews, jitter_colors, lay_out, resize_crop
+from l3r.data.store import UnreachableError
 from l3r.errors import DataError
 from l3r.types import Views
 
@@ -69,7 +70,7 @@ class StepBatch:
 
     views: PackedViews | Views | None
     """The batch, packed until it has left the worker; None where no sample of a source could be
-    read."""
+    read, or the source does not answer; the last line of ``skipped`` says why."""
     skipped: list[str]
     """One line for each unreadable sample, which another of the same source replaced."""
 
@@ -161,7 +162,8 @@ def read_or_another(
         colors: Change of each image's colours; empty: none.
 
     Returns:
-        None where ``MAX_ATTEMPTS`` in a row cannot be read.
+        None where ``MAX_ATTEMPTS`` in a row cannot be read, or at once where the place does not
+        answer at all.
     """
     total = len(folder)
     stride = max(1, round(_GOLDEN * total))
@@ -171,6 +173,9 @@ def read_or_another(
         current = (index + attempt * stride) % total
         try:
             return _read_fitted(folder, current, image_size, colors)
+        except UnreachableError as error:
+            skipped.append(str(error))
+            return None
         except DataError as error:
             skipped.append(f"{folder.key(current)}: {error}")
     return None

@@ -12,6 +12,11 @@ from l3r.data.schema import (
     read_manifest,
     read_range,
 )
+from l3r.errors import DataError
+
+
+class UnreachableError(DataError):
+    """A place that does not answer at all: no other graph of it can be read either."""
 
 
 class ShardStore(ABC):

@@ -1,5 +1,6 @@
 """Shards from a real web server: ranges, connections, faults."""
 
+import contextlib
 import json
 import pickle
 import shutil
@@ -12,8 +13,8 @@ from l3r.data import http_store, schema
 from l3r.data.http_store import HttpStore
 from l3r.data.loader import build_training_loader
 from l3r.data.source import ShardFolder, open_store
-from l3r.data.steps import DeviceShare
-from l3r.data.store import FolderStore
+from l3r.data.steps import DeviceShare, read_or_another
+from l3r.data.store import FolderStore, UnreachableError
 from l3r.errors import DataError
 from tests.data.graphs import make_graph, write_folder
 from tests.data.range_server import serve
@@ -123,8 +124,79 @@ def test_a_range_other_than_asked_for_is_refused(remote, server, monkeypatch):
             206, path.read_bytes()[:9], {"Content-Range": "bytes 0-8/9"}
         ),
     )
-    with pytest.raises(DataError, match=r"sends 'bytes 0-8/9', expected bytes \d{3,}-"):
+    with pytest.raises(DataError, match=r"sends 'bytes 0-8/9' of 9 bytes, expected bytes \d{3,}-"):
         remote.read(1)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda first, last: (f"bytes {first}-{last + 1}/99999999", 0), "the server sends 'bytes"),
+        (lambda first, last: (f"bytes {first}-{last - 1}/99999999", 0), "the server sends 'bytes"),
+        (lambda first, last: ("", 0), "the server sends ''"),
+        (lambda first, last: (f"bytes {first}-{last}/99999999", -1), "the server sends 'bytes"),
+        (lambda first, last: (f"bytes {first}-{last}/99999999", 1), "sends more than was asked"),
+    ],
+)
+def test_a_range_or_length_other_than_asked_is_refused(remote, server, monkeypatch, change, words):
+    def answer_range(handler, path, asked, fault):
+        first, last = map(int, asked.removeprefix("bytes=").split("-"))
+        span, more = change(first, last)
+        handler.answer(206, bytes(last - first + 1 + more), {"Content-Range": span})
+
+    monkeypatch.setattr("tests.data.range_server.Handler.answer_range", answer_range)
+    with pytest.raises(DataError, match=words):
+        remote.read(1)
+
+
+def test_a_flood_is_not_drunk(remote, server, shards, monkeypatch):
+    """Without a length, for as long as somebody reads."""
+    sent = []
+
+    def flood(handler, status, data, headers=None, fault=None):
+        handler.send_response(status)
+        for name, value in {**(headers or {}), "Connection": "close"}.items():
+            handler.send_header(name, value)
+        handler.end_headers()
+        handler.close_connection = True
+        sent.append(0)
+        with contextlib.suppress(OSError):
+            while sent[-1] < 2**30:
+                sent[-1] += handler.wfile.write(data)
+
+    monkeypatch.setattr("tests.data.range_server.Handler.answer", flood)
+    monkeypatch.setattr(http_store, "MAX_FILE_BYTES", 10_000)
+    with pytest.raises(DataError, match="the server sends more than was asked"):
+        remote.read(1)
+    with pytest.raises(DataError, match=r"manifest\.json: the server sends more than was asked"):
+        remote.store.read_manifest()
+    assert max(sent) < 2**26  # buffers of the system
+
+
+def test_a_trickle_ends(remote, monkeypatch):
+    monkeypatch.setattr(http_store, "MAX_SECONDS", -1.0)
+    with pytest.raises(DataError, match=r"bytes in .* s, 1 times in a row"):
+        remote.read(1)
+
+
+def test_a_server_that_is_gone_stops_a_run_without_trying_other_graphs(shards):
+    with serve(shards.parent) as running:
+        folder = ShardFolder(HttpStore(f"{running.url}/{shards.name}"), 3)
+    folder.store = pickle.loads(pickle.dumps(folder.store))  # without the connection it kept
+    skipped = []
+    assert read_or_another(folder, 0, (32, 32), skipped) is None
+    (line,) = skipped
+    assert "refused" in line
+    assert "4 times in a row; look after the server" in line
+    with pytest.raises(UnreachableError):
+        folder.read(0)
+
+
+def test_a_server_that_fails_on_one_graph_is_asked_for_another(remote, server):
+    server.faults.extend(["close"] * 4)
+    skipped = []
+    assert read_or_another(remote, 0, (32, 32), skipped) is not None
+    assert len(skipped) == 1
 
 
 def test_redirects_are_followed_range_and_all(remote, server, shards):
@@ -148,8 +220,8 @@ def test_what_is_missing_or_does_not_belong_together_is_said(server, shards, tmp
     with pytest.raises(DataError, match=r"nothing/manifest\.json: .*404.*finished shards"):
         ShardFolder(HttpStore(f"{server.url}/nothing"), 3)
     index = schema.index_path(copied / "hand-000001.tar")
-    index.write_text(json.dumps({**json.loads(index.read_text()), "tar_bytes": 10}))
-    with pytest.raises(DataError, match=r"index\.json: made of a tar of 10 bytes"):
+    index.write_text(json.dumps({**json.loads(index.read_text()), "tar_bytes": 10**9}))
+    with pytest.raises(DataError, match=r"index\.json: made of a tar of 1000000000 bytes"):
         ShardFolder(HttpStore(f"{server.url}/copied"), 3)
     index.unlink()
     with pytest.raises(DataError, match=r"hand-000001\.index\.json: .*404.*l3r-prep build"):
@@ -207,7 +279,7 @@ def test_files_that_are_no_index_or_manifest_are_named(data):
 def test_a_range_beyond_the_end_of_a_tar_on_disk_is_named(shards):
     tar = shards / "hand-000000.tar"
     entry = schema.index_shard(tar).graphs[0]
-    assert schema.members_from_bytes(schema.read_range(tar, entry), "x")["__key__"] == entry.key
+    assert schema.members_from_bytes(schema.read_range(tar, entry), "x", entry.key)
     beyond = schema.IndexEntry(key="k", offset=tar.stat().st_size - 5, size=10, num_views=1)
     with pytest.raises(DataError, match=r"hand-000000\.tar:k: 5 of 10 bytes"):
         schema.read_range(tar, beyond)

@@ -248,7 +248,7 @@ def test_nothing_readable_stops_at_once(tmp_path):
         spoil(folder, number)
     for num_workers in (0, 1):
         data = config(folder, max_skip_rate=1.0, num_workers=num_workers)
-        with pytest.raises(DataError, match="graphs in a row cannot be read") as error:
+        with pytest.raises(DataError, match="no graph can be read; last: ") as error:
             keys(loader(data))
         assert "\n" not in str(error.value)  # even out of a worker
 

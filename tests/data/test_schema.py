@@ -1,3 +1,4 @@
+import dataclasses
 import io
 import json
 import tarfile
@@ -210,7 +211,7 @@ def test_a_range_that_is_off_is_refused(tmp_path):
         stream.seek(entry.offset + 100)
         data = stream.read(entry.size)
     with pytest.raises(DataError, match="delete the shard's index"):
-        schema.members_from_bytes(data, "here")
+        schema.members_from_bytes(data, "here", entry.key)
 
 
 def test_members_that_do_not_stand_together_are_refused(tmp_path):
@@ -268,3 +269,69 @@ def test_intrinsics_no_reader_could_use_are_refused(change):
         sample.K[1, row, column] = value
     with pytest.raises(DataError, match="here: image 01: K "):
         check_cameras(sample.K, sample.cam_from_world, "here")
+
+
+BAD_ENTRIES = {
+    "offset is -512": {"offset": -512},
+    "offset is 1.5": {"offset": 1.5},
+    "offset is True": {"offset": True},
+    "multiples of 512": {"offset": 7},
+    "size is 0": {"size": 0},
+    "the tar at": {"size": 512 * 10**6},
+    "size is 9223372036854775808": {"size": 2**63},
+    "num_views is 0": {"num_views": 0},
+    "num_views is 'many'": {"num_views": "many"},
+    "expected a printable name": {"key": ""},
+    "printable name without": {"key": 5},
+    "overlaps that of": {"offset": 512},
+    "a key stands there twice": {"key": "toy-0"},
+}
+
+
+@pytest.mark.parametrize("words", list(BAD_ENTRIES))
+def test_an_index_that_no_tar_has_is_refused_by_its_entry_and_made_again(tmp_path, words):
+    shard = write_shard(tmp_path / "toy.tar")
+    index = schema.index_shard(shard)
+    schema.write_index(shard, index)
+    path = schema.index_path(shard)
+    plain = json.loads(path.read_bytes())
+    plain["graphs"][1].update(BAD_ENTRIES[words])
+    path.write_text(json.dumps(plain))
+    with pytest.raises(DataError, match=rf"toy\.index\.json: no index \(.*{words}"):
+        schema.read_index(shard)
+    assert schema.load_index(shard) == index
+
+
+def test_an_index_that_swaps_two_graphs_is_found_when_one_is_read(tmp_path):
+    shard = write_shard(tmp_path / "toy.tar")
+    one, two = schema.index_shard(shard).graphs
+    swapped = dataclasses.replace(one, offset=two.offset, size=two.size)
+    with pytest.raises(DataError, match="the index says toy-0, the tar holds 'toy-1'; delete"):
+        schema.read_members(shard, swapped)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"name": "../3.tar"},
+        {"name": ".3.tar"},
+        {"name": "/3.tar"},
+        {"name": "3.zip"},
+        {"name": "4.tar"},
+        {"name": 3},
+        {"num_graphs": -1},
+        {"num_graphs": "3"},
+        {"bytes": 1e9},
+        {"bytes": 2**63},
+        {"sha256": "0" * 63},
+        {"sha256": "z" * 64},
+    ],
+)
+def test_a_manifest_that_nobody_wrote_is_refused(tmp_path, change):
+    schema.write_manifest(tmp_path, make_manifest())
+    path = tmp_path / schema.MANIFEST_NAME
+    plain = json.loads(path.read_bytes())
+    plain["shards"][0].update(change)
+    path.write_text(json.dumps(plain))
+    with pytest.raises(DataError, match=r"manifest\.json: no manifest"):
+        schema.read_manifest(tmp_path)

@@ -189,11 +189,11 @@ def test_rendered_data_is_held_to_tighter_limits_than_sensors():
         assert LIMITS[name].max_round_trip < NOISY.max_round_trip
 
 
-def test_an_index_is_not_needed(room_shards, tmp_path):
+def test_a_missing_index_is_a_fault(room_shards, tmp_path):
     folder = plant(room_shards, tmp_path, none)
     for shard in read_manifest(folder).shards:
         index_path(folder / shard.name).unlink()
-    assert check(folder) == 0
+    assert check(folder) == 2
 
 
 def test_a_folder_without_shards_is_refused(tmp_path, capsys):

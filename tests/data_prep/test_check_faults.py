@@ -164,12 +164,40 @@ def test_a_damaged_tar_loses_its_graphs_and_the_others_are_read(folder, complain
     assert f"{kind}: {tar.name}: " in message
 
 
-def test_a_header_overwritten_under_a_good_index_costs_its_graph(folder):
+def test_a_header_overwritten_under_a_good_index_costs_the_tar(folder):
     tar = damage.first_tar(folder)
     damage.spoil_header(tar, 1)
     report = check_shards(folder, CheckOptions(decode_all=True))
+    assert [(fault.kind, fault.shard) for fault in report.faults.listed] == [
+        ("wrong_graph_count", tar.name)
+    ]
+
+
+def other_index(path):
+    plain = json.loads(path.read_text())
+    plain["graphs"][0]["num_views"] += 1
+    path.write_text(json.dumps(plain))
+
+
+INDEX_DAMAGE = {
+    "deleted": (lambda path: path.unlink(), "no index"),
+    "of other views": (other_index, "says other than the tar's headers"),
+    "no JSON": (lambda path: path.write_text("{"), "no index"),
+}
+
+
+@pytest.mark.parametrize("name", list(INDEX_DAMAGE))
+def test_a_wrong_index_fails_the_check_and_its_graphs_are_read(folder, complaint, name):
+    spoil, words = INDEX_DAMAGE[name]
+    tar = damage.first_tar(folder)
+    spoil(index_path(tar))
+    report = check_shards(folder, EVERYTHING)
     (fault,) = report.faults.listed
-    assert (fault.kind, fault.key) == ("unreadable_graph", damage.keys_of(tar)[1])
+    assert (fault.kind, fault.shard, fault.key) == ("wrong_index", tar.name, "")
+    assert words in fault.detail
+    assert (report.num_damaged_tars, report.num_read, report.num_bad) == (1, 5, 0)
+    assert check(folder, "--max-bad-share", "1") == 2
+    assert f"wrong_index: {tar.name}: " in complaint()
 
 
 def test_a_wrong_checksum_shows_only_where_checksums_are_compared(folder, capsys):

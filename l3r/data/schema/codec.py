@@ -3,6 +3,7 @@
 import io
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import fields
 from typing import Any
 
@@ -12,6 +13,7 @@ import torch
 from jaxtyping import Float32, Float64, UInt8
 
 from l3r.data.schema.graph import SCHEMA_VERSION, GraphSample, PairTable, check_cameras
+from l3r.data.schema.headers import depth_pixels, jpeg_size
 from l3r.errors import DataError
 
 _JPEG = [
@@ -62,21 +64,11 @@ def decode_graph(members: Mapping[str, Any], num_views: int) -> GraphSample:
     """
     key = str(members.get("__key__", "?"))
     meta = _decode_meta(_member(members, key, "json"), f"{key}.json", num_views)
-    views = range(num_views)
-    image = [
-        _decode_image(_member(members, key, f"{v:02d}.jpg"), f"{key}.{v:02d}.jpg") for v in views
-    ]
-    depth = [
-        _decode_depth(_member(members, key, f"{v:02d}.depth.npy"), f"{key}.{v:02d}.depth.npy")
-        for v in views
-    ]
-    for view, expected in enumerate(meta.pop("image_size")):
-        for name, found in (("jpg", image[view].shape[:2]), ("depth.npy", depth[view].shape)):
-            if found != expected:
-                raise DataError(
-                    f"{key}.{view:02d}.{name}: (height, width) {found}, the meta says {expected};"
-                    " rebuild the shard with l3r-prep"
-                )
+    image, depth = [], []
+    for view, size in enumerate(meta.pop("image_size")):
+        jpg, npy = f"{view:02d}.jpg", f"{view:02d}.depth.npy"
+        image.append(_decode_image(_member(members, key, jpg), size, f"{key}.{jpg}"))
+        depth.append(_decode_depth(_member(members, key, npy), size, f"{key}.{npy}"))
     return GraphSample(image=image, depth=depth, **meta)
 
 
@@ -110,24 +102,27 @@ def _decode_meta(data: bytes, where: str, num_views: int) -> dict[str, Any]:
     """Give the fields of :class:`GraphSample` but the pixels, and ``image_size``."""
     try:
         meta = json.loads(data)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{where}: no JSON ({error}); rebuild the shard with l3r-prep") from error
     version = meta.get("schema_version") if isinstance(meta, dict) else None
     if version != SCHEMA_VERSION:
         raise DataError(
-            f"{where}: schema version {version}, expected {SCHEMA_VERSION};"
+            f"{where}: schema version {version!r:.40}, expected {SCHEMA_VERSION};"
             " rebuild the shard with l3r-prep of this version"
         )
     try:
         return _parse_meta(meta, where, num_views)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise DataError(
-            f"{where}: field missing or of a wrong shape ({error!r}); rebuild it with l3r-prep"
+            f"{where}: field missing or of a wrong shape ({error!r:.200}); rebuild it with l3r-prep"
         ) from error
 
 
 def _parse_meta(meta: dict[str, Any], where: str, num_views: int) -> dict[str, Any]:
-    total = len(meta["file"])
+    file, image_size = _parse_names(meta["file"]), _parse_sizes(meta["image_size"])
+    total = len(file)
+    if len(image_size) != total:
+        raise ValueError(f"image_size has {len(image_size)} entries, expected {total}")
     if total < num_views:
         raise DataError(
             f"{where}: {total} images, {num_views} asked;"
@@ -141,16 +136,33 @@ def _parse_meta(meta: dict[str, Any], where: str, num_views: int) -> dict[str, A
         f.name: np.array(meta["pairs"][f.name], dtype=np.float64).reshape(total, total)
         for f in fields(PairTable)
     }
+    if type(meta["is_metric"]) is not bool:
+        raise TypeError("is_metric is neither true nor false")
+    dataset, scene = _parse_names([meta["dataset"], meta["scene"]])
     return {
-        "dataset": str(meta["dataset"]),
-        "scene": str(meta["scene"]),
-        "is_metric": bool(meta["is_metric"]),
-        "file": [str(name) for name in meta["file"][first]],
-        "image_size": [(int(h), int(w)) for h, w in meta["image_size"][first]],
+        "dataset": dataset,
+        "scene": scene,
+        "is_metric": meta["is_metric"],
+        "file": file[first],
+        "image_size": image_size[first],
         "K": K,
         "cam_from_world": cam_from_world,
         "pairs": PairTable(**pairs)[first],
     }
+
+
+def _parse_names(value: Any) -> list[str]:
+    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
+        raise TypeError("dataset, scene or file is no text")
+    return value
+
+
+def _parse_sizes(value: Any) -> list[tuple[int, int]]:
+    if any(
+        type(side) is not int or side < 1 for height, width in value for side in (height, width)
+    ):
+        raise ValueError("image_size holds other than positive whole numbers")
+    return [(height, width) for height, width in value]
 
 
 def _encode_image(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
@@ -159,12 +171,20 @@ def _encode_image(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
     return bytes(data.tobytes())
 
 
-def _decode_image(data: bytes, where: str) -> UInt8[np.ndarray, "h w 3"]:
-    # The decoder fills a JPEG that is cut off with grey and only warns, so look for its end mark.
+def _decode_image(data: bytes, size: tuple[int, int], where: str) -> UInt8[np.ndarray, "h w 3"]:
+    # Before any pixel is decoded: a damaged header may ask for gigabytes.
+    found = jpeg_size(data)
+    if found is not None and found != size:
+        raise DataError(
+            f"{where}: (height, width) {found}, the meta says {size};"
+            " rebuild the shard with l3r-prep"
+        )
     image = None
-    if data.endswith(b"\xff\xd9"):
-        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
-    if image is None:
+    # The decoder fills a JPEG that is cut off with grey and only warns, so look for its end mark.
+    if found is not None and data.endswith(b"\xff\xd9"):
+        with suppress(cv2.error):
+            image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
+    if image is None or image.shape[:2] != size:
         raise DataError(f"{where}: no whole JPEG ({len(data)} bytes); rebuild it with l3r-prep")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
 
@@ -177,19 +197,16 @@ def _encode_depth(depth: Float32[np.ndarray, "h w"], where: str) -> bytes:
             f" {_LARGEST:.0f}; mark it unknown, or scale a scene that has no metres"
         )
     stream = io.BytesIO()
-    np.save(stream, depth.astype(np.float16), allow_pickle=False)
+    np.save(stream, depth.astype(np.float16, order="C"), allow_pickle=False)
     return stream.getvalue()
 
 
-def _decode_depth(data: bytes, where: str) -> Float32[np.ndarray, "h w"]:
-    try:
-        depth = np.load(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise DataError(f"{where}: no whole array ({error}); rebuild it with l3r-prep") from error
-    if depth.dtype != np.float16 or depth.ndim != 2:
+def _decode_depth(data: bytes, size: tuple[int, int], where: str) -> Float32[np.ndarray, "h w"]:
+    depth = depth_pixels(data, size)
+    if depth is None:
         raise DataError(
-            f"{where}: {depth.dtype} of {depth.ndim} dimensions, expected float16 of 2;"
-            " rebuild it with l3r-prep"
+            f"{where}: no whole array ({len(data)} bytes), expected what numpy.save writes of"
+            f" float16 {size}; rebuild it with l3r-prep"
         )
     # Twenty times as fast as numpy's own conversion; a NaN makes both comparisons false.
     z: Float32[np.ndarray, "h w"] = torch.from_numpy(depth).float().numpy()

@@ -101,8 +101,10 @@ def _find_problem(K: Float64[np.ndarray, "3 3"], cam_from_world: Float64[np.ndar
     if not (K[0, 0] > 0 and K[1, 1] > 0 and np.array_equal(K[2], [0, 0, 1])):
         return f"K is {K.tolist()}, expected positive focal lengths and a last row 0 0 1"
     rotation = cam_from_world[:3, :3]
-    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if error > _ORTHONORMAL or np.linalg.det(rotation) < 0:
+    # A turn has no entry above 1; the square of a huge one would overflow.
+    bounded = np.clip(rotation, -2, 2)
+    error = float(np.abs(bounded @ bounded.T - np.eye(3)).max())
+    if error > _ORTHONORMAL or np.linalg.det(bounded) < 0:
         return (
             f"cam_from_world is off a rotation by {error:.1e}, expected {_ORTHONORMAL:.0e} or less"
         )

@@ -5,6 +5,7 @@ import json
 import re
 import tarfile
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from l3r.files import write_atomic
 
 _BLOCK = 512
 _IMAGE = re.compile(r"\d\d\.jpg")
+_BEYOND = 2**63
+"""Offsets travel as 64-bit integers."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -84,11 +87,52 @@ def parse_index(data: bytes, where: str) -> ShardIndex:
     try:
         plain = json.loads(data)
         if plain["schema_version"] != SCHEMA_VERSION:
-            raise ValueError(f"schema version {plain['schema_version']}")
+            raise ValueError(f"schema version {plain['schema_version']!r:.40}")
+        tar_bytes = plain["tar_bytes"]
+        if type(tar_bytes) is not int or not 0 < tar_bytes < _BEYOND:
+            raise ValueError(f"tar_bytes is {tar_bytes!r:.40}, expected the size of a tar")
+        for number, entry in enumerate(plain["graphs"]):
+            problem = _find_problem(entry, tar_bytes)
+            if problem:
+                raise ValueError(f"graph {number}, key {entry['key']!r:.80}: {problem}")
         graphs = [IndexEntry(**entry) for entry in plain["graphs"]]
-        return ShardIndex(tar_bytes=int(plain["tar_bytes"]), graphs=graphs)
-    except (ValueError, KeyError, TypeError) as error:
+        _check_apart(graphs)
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise DataError(f"{where}: no index ({error}); delete it, it is made again") from error
+    return ShardIndex(tar_bytes=tar_bytes, graphs=graphs)
+
+
+def _find_problem(entry: dict[str, Any], tar_bytes: int) -> str:
+    """Say what no graph of a tar can be; the fields are as JSON gave them."""
+    if not isinstance(entry["key"], str) or not _is_key(entry["key"]):
+        return "expected a printable name without dots and slashes"
+    for name, least in (("offset", 0), ("size", _BLOCK), ("num_views", 1)):
+        value = entry[name]
+        if type(value) is not int or not least <= value < _BEYOND:
+            return f"{name} is {value!r:.40}, expected a whole number of {least} or more"
+    offset, size = entry["offset"], entry["size"]
+    if offset % _BLOCK or size % _BLOCK:
+        return f"offset {offset}, size {size}: expected multiples of {_BLOCK}"
+    if offset + size > tar_bytes:
+        return f"it ends at {offset + size}, the tar at {tar_bytes}"
+    return ""
+
+
+def _check_apart(graphs: list[IndexEntry]) -> None:
+    """Refuse graphs that share bytes or a key.
+
+    Raises:
+        ValueError: Two do.
+    """
+    for one, two in pairwise(sorted(graphs, key=lambda entry: entry.offset)):
+        if one.offset + one.size > two.offset:
+            raise ValueError(f"key {two.key!r:.80}: its range overlaps that of {one.key!r:.80}")
+    if len({entry.key for entry in graphs}) < len(graphs):
+        raise ValueError("a key stands there twice")
+
+
+def _is_key(key: str) -> bool:
+    return bool(key) and key.isprintable() and not any(letter in key for letter in "./\\")
 
 
 def load_index(shard: Path) -> ShardIndex:
@@ -115,6 +159,11 @@ def index_shard(shard: Path) -> ShardIndex:
         with tarfile.open(shard, "r:") as tar:
             for member in tar:
                 key, _, name = member.name.partition(".")
+                if not _is_key(key):
+                    raise DataError(
+                        f"{shard}: found member {member.name!r:.80}, expected the files of graphs;"
+                        " rebuild it with l3r-prep"
+                    )
                 if key in graphs and key != last:
                     raise DataError(
                         f"{shard}: members of {key} do not stand together; rebuild it with l3r-prep"
@@ -129,38 +178,44 @@ def index_shard(shard: Path) -> ShardIndex:
         # A tar cut off within a header reads like one that ends; only its end mark is missing.
         if shard.stat().st_size < end + 2 * _BLOCK:
             raise tarfile.ReadError("the mark at its end is missing")
-    except (OSError, tarfile.TarError) as error:
+    except (OSError, tarfile.TarError, ValueError) as error:
         raise DataError(f"{shard}: no whole tar ({error}); rebuild it with l3r-prep") from error
     entries = [IndexEntry(**graph) for graph in graphs.values()]
     return ShardIndex(tar_bytes=shard.stat().st_size, graphs=entries)
 
 
-def members_from_bytes(data: bytes, where: str) -> dict[str, Any]:
+def members_from_bytes(data: bytes, where: str, key: str) -> dict[str, Any]:
     """Split the bytes of one graph's range into members.
 
     Args:
         data: ``size`` bytes of the tar from ``offset``, or any part that ends between records.
         where: What a message begins with: the shard and key.
+        key: The graph they are said to be.
 
     Returns:
         ``__key__`` and the members' bytes, as :func:`decode_graph` takes them.
 
     Raises:
-        DataError: The bytes are cut off or hold more than one key.
+        DataError: The bytes are cut off, or of another key, or hold what is no file.
     """
-    members: dict[str, Any] = {}
+    members: dict[str, Any] = {"__key__": key}
     try:
         with tarfile.open(fileobj=io.BytesIO(data), mode="r:") as tar:
             for member in tar:
-                stream = tar.extractfile(member)
-                key, _, name = member.name.partition(".")
-                if stream is None or members.setdefault("__key__", key) != key:
+                stream = tar.extractfile(member) if member.isreg() else None
+                found, _, name = member.name.partition(".")
+                if found != key:
                     raise DataError(
-                        f"{where}: found member {member.name}, expected files of one key;"
+                        f"{where}: the index says {key}, the tar holds {found!r:.80}; delete the"
+                        " shard's index, it is made again"
+                    )
+                if stream is None:
+                    raise DataError(
+                        f"{where}: found member {member.name!r:.80}, expected files of one key;"
                         " delete the shard's index, it is made again"
                     )
                 members[name] = stream.read()
-    except tarfile.TarError as error:
+    except (tarfile.TarError, ValueError) as error:
         raise DataError(
             f"{where}: bytes cut off or no tar ({error}); delete the shard's index, it is made"
             " again, or rebuild the shard with l3r-prep"
@@ -174,7 +229,7 @@ def read_members(shard: Path, entry: IndexEntry) -> dict[str, Any]:
     Raises:
         DataError: The range cannot be read or is not what the index says.
     """
-    return members_from_bytes(read_range(shard, entry), f"{shard.name}:{entry.key}")
+    return members_from_bytes(read_range(shard, entry), f"{shard.name}:{entry.key}", entry.key)
 
 
 def read_range(shard: Path, entry: IndexEntry) -> bytes:

@@ -1,6 +1,7 @@
 """``manifest.json``: what a folder of shards holds."""
 
 import json
+import re
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,9 @@ from l3r.files import write_atomic
 
 MANIFEST_NAME = "manifest.json"
 """Name of the manifest in its folder; it is written last, so a folder that has it is complete."""
+
+_TAR_NAME = re.compile(r"(?!\.)[^/\\\x00-\x1f\ud800-\udfff]+\.tar")
+_DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,13 +102,42 @@ def parse_manifest(data: bytes, where: str) -> Manifest:
         version = plain.pop("schema_version")
         if version == SCHEMA_VERSION:
             del plain["num_graphs"], plain["num_bytes"]
+            _check_fields(plain)
             shards = [ShardEntry(**entry) for entry in plain.pop("shards")]
             return Manifest(shards=shards, **plain)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DataError(
-            f"{where}: no manifest ({error!r}); rebuild the shards with l3r-prep"
+            f"{where}: no manifest ({error!r:.300}); rebuild the shards with l3r-prep"
         ) from error
     raise DataError(
-        f"{where}: schema version {version}, expected {SCHEMA_VERSION};"
+        f"{where}: schema version {version!r:.40}, expected {SCHEMA_VERSION};"
         " rebuild the shards with l3r-prep of this version"
     )
+
+
+def _check_fields(plain: dict[str, Any]) -> None:
+    """Refuse what nobody wrote; the fields are as JSON gave them.
+
+    Raises:
+        ValueError: A field is of another type or out of range, or two shards share a name.
+    """
+    if not isinstance(plain["dataset"], str) or not isinstance(plain.get("request", {}), dict):
+        raise ValueError("dataset is no text, or request no table")
+    for field_name in ("min_views", "max_views"):
+        _check_count(plain[field_name], field_name)
+    names = set()
+    for shard in plain["shards"]:
+        name, digest = shard["name"], shard["sha256"]
+        # The name becomes part of a path and of an address.
+        if not isinstance(name, str) or not _TAR_NAME.fullmatch(name) or name in names:
+            raise ValueError(f"shard {name!r:.80}, expected the plain name of a .tar, named once")
+        names.add(name)
+        for field_name in ("num_graphs", "bytes"):
+            _check_count(shard[field_name], f"{field_name} of {name}")
+        if not isinstance(digest, str) or not _DIGEST.fullmatch(digest):
+            raise ValueError(f"sha256 of {name} is {digest!r:.80}, expected 64 hexadecimal digits")
+
+
+def _check_count(value: Any, name: str) -> None:
+    if type(value) is not int or not 0 <= value < 2**63:
+        raise ValueError(f"{name} is {value!r:.40}, expected a whole number of 0 or more")
