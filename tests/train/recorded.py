@@ -21,7 +21,7 @@ _step = TrainModule.training_step
 
 
 def training_step(self, batch, batch_idx):
-    loss = _step(self, batch, batch_idx)
+    outputs = _step(self, batch, batch_idx)
     step, rank = self.trainer.global_step + 1, self.trainer.global_rank
     if folder := os.environ.get("RECORD"):
         row = {"step": step, "keys": batch.key, "size": list(batch.image.shape)}
@@ -33,7 +33,8 @@ def training_step(self, batch, batch_idx):
     if os.environ.get("HANG_AT") == here:
         time.sleep(600)
     # After the loss was computed: its gradient is what must not reach the weights.
-    return loss * torch.nan if os.environ.get("NAN_AT") == here else loss
+    is_bad = os.environ.get("NAN_AT") == here
+    return {**outputs, "loss": outputs["loss"] * torch.nan} if is_bad else outputs
 
 
 TrainModule.training_step = training_step
