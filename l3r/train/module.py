@@ -15,7 +15,8 @@ from l3r.loss.joint import JointLoss, LossTerms
 from l3r.metrics.cameras import CameraMetrics, camera_metrics, mean_metrics
 from l3r.model.light3r import Light3R
 from l3r.train.optim import build_optimizer, build_schedule
-from l3r.train.run_log import DatasetMeans, gather
+from l3r.train.ranks import Agreement
+from l3r.train.run_log import DatasetMeans
 from l3r.types import Prediction, Reconstruction, Views
 
 
@@ -26,15 +27,19 @@ class TrainModule(L.LightningModule):
         config: The whole run; stored in every checkpoint.
         model: The network.
         loss: Joint loss.
+        agreement: With the other processes of the run.
     """
 
-    def __init__(self, config: RunConfig, model: Light3R, loss: JointLoss) -> None:
+    def __init__(
+        self, config: RunConfig, model: Light3R, loss: JointLoss, agreement: Agreement
+    ) -> None:
         super().__init__()
         self.config = config
         self.model = model
         self.loss = loss
         self.accuracy: list[tuple[str, CameraMetrics]] = []
-        self.dataset_losses = DatasetMeans()
+        self.agreement = agreement
+        self.dataset_losses = DatasetMeans(agreement)
 
     def training_step(self, batch: Views, batch_idx: int) -> dict[str, Any]:
         """Run one optimisation step's forward pass.
@@ -64,7 +69,7 @@ class TrainModule(L.LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         """Log the mean accuracy over graphs, of all and of each data set."""
-        scored = [pair for part in gather(self.accuracy) for pair in part]
+        scored = [pair for part in self.agreement.gather(self.accuracy) for pair in part]
         mean = mean_metrics([metrics for _, metrics in scored]).to_dict()
         for dataset in sorted({name for name, _ in scored}):
             own = mean_metrics([metrics for name, metrics in scored if name == dataset])

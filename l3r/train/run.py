@@ -64,11 +64,12 @@ def train(config: RunConfig) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         clear_leftovers(last)
         write_atomic(folder / "config.yaml", to_yaml(config).encode())
-    module = TrainModule(config, model, JointLoss(config.loss))
+    agreement = Agreement()
+    module = TrainModule(config, model, JointLoss(config.loss), agreement)
     _quieten_lightning()
     files = CheckpointFiles(config.train.accumulate)
     with StopSignals() as signals:
-        callbacks = _build_callbacks(config, signals, sinks)
+        callbacks = _build_callbacks(config, signals, sinks, agreement)
         trainer = _build_trainer(config, ranks, callbacks, files)
         try:
             trainer.fit(
@@ -103,17 +104,18 @@ def _build_model(config: RunConfig, ranks: Ranks, *, is_fresh: bool) -> Light3R:
     return model
 
 
-def _build_callbacks(config: RunConfig, signals: StopSignals, sinks: list[Sink]) -> list[Callback]:
+def _build_callbacks(
+    config: RunConfig, signals: StopSignals, sinks: list[Sink], agreement: Agreement
+) -> list[Callback]:
     train = config.train
     folder = Path(train.output_dir)
-    agreement = Agreement()
     callbacks: list[Callback] = [
         RoomGradients(train.log_every),
         StepMean(),
         GradientGuard(folder / "bad_steps.jsonl", train.max_bad_steps, agreement),
         StepTimer(),
         # On all processes, which give it their figures; the first one writes.
-        RunLog(folder, train.log_every, sinks, pictures=config.logs.pictures),
+        RunLog(folder, train.log_every, agreement, sinks, pictures=config.logs.pictures),
         StepProgress(),
     ]
     return [*callbacks, StepCheckpoint(folder / "last.ckpt", config, signals, agreement)]

@@ -10,7 +10,6 @@ from typing import Any
 
 import lightning as L
 import torch
-import torch.distributed as dist
 from jaxtyping import Float
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor
@@ -18,7 +17,7 @@ from torch import Tensor
 from l3r.export.graph_sheet import write_graph_sheet
 from l3r.files import write_atomic
 from l3r.train.csv_table import append_row, drop_rows_after
-from l3r.train.ranks import step_is_whole
+from l3r.train.ranks import Agreement, step_is_whole
 from l3r.train.sinks import Sink
 from l3r.types import Views
 from l3r.version import __version__
@@ -29,9 +28,13 @@ class DatasetMeans:
 
     Values that are not finite are left out: their steps are skipped. Adding does not wait for the
     device; taking does.
+
+    Args:
+        agreement: With the other processes.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, agreement: Agreement) -> None:
+        self.agreement = agreement
         self._totals: dict[str, Float[Tensor, " 2"]] = {}  # sum and count
 
     def add(self, datasets: Sequence[str], figures: Mapping[str, Float[Tensor, " b"]]) -> None:
@@ -52,7 +55,7 @@ class DatasetMeans:
         own = {key: total.tolist() for key, total in self._totals.items()}
         self._totals.clear()
         totals: dict[str, list[float]] = {}
-        for part in gather(own):
+        for part in self.agreement.gather(own):
             for key, (sum_, count) in part.items():
                 before = totals.get(key, [0.0, 0.0])
                 totals[key] = [before[0] + sum_, before[1] + count]
@@ -67,15 +70,6 @@ class DatasetMeans:
         self._totals = dict(state)
 
 
-def gather(own: Any) -> list[Any]:
-    """Collect an object of builtins from every process; waits for all of them."""
-    if not (dist.is_available() and dist.is_initialized()):
-        return [own]
-    parts: list[Any] = [None] * dist.get_world_size()
-    dist.all_gather_object(parts, own)
-    return parts
-
-
 class RunLog(Callback):
     """Writes ``metrics.csv`` (training), ``validation.csv`` and the sinks, one row a time.
 
@@ -85,12 +79,19 @@ class RunLog(Callback):
     Args:
         folder: The run's folder.
         every: Steps between training rows.
+        agreement: With the other processes.
         sinks: Other places for the same rows.
         pictures: Whether to draw the first validation graph at each validation.
     """
 
     def __init__(
-        self, folder: Path, every: int, sinks: Sequence[Sink] = (), *, pictures: bool = False
+        self,
+        folder: Path,
+        every: int,
+        agreement: Agreement,
+        sinks: Sequence[Sink] = (),
+        *,
+        pictures: bool = False,
     ) -> None:
         self.folder = folder
         self.pictures = pictures
@@ -98,7 +99,8 @@ class RunLog(Callback):
         self.validation = folder / "validation.csv"
         self.every = every
         self.sinks = sinks
-        self.datasets = DatasetMeans()
+        self.agreement = agreement
+        self.datasets = DatasetMeans(agreement)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Forget what a stopped run wrote after its checkpoint."""
@@ -124,7 +126,9 @@ class RunLog(Callback):
         if not is_due or not step_is_whole(trainer, batch_idx):
             return
         row = {"lr": float(trainer.optimizers[0].param_groups[0]["lr"])}
-        row |= _mean_over_processes(_numbers(trainer.callback_metrics, "train/"))
+        own = _numbers(trainer.callback_metrics, "train/")
+        parts = self.agreement.gather(own)
+        row |= {name: sum(part[name] for part in parts) / len(parts) for name in own}
         if torch.cuda.is_available():
             row["gpu_gib"] = torch.cuda.max_memory_allocated() / 2**30
         self._write(trainer, "train", row | self.datasets.take())
@@ -205,8 +209,3 @@ def _numbers(metrics: Mapping[str, Tensor], prefix: str) -> dict[str, float]:
     # Those of single data sets, which have one more slash, come last.
     names = sorted(chosen, key=lambda name: (name.count("/"), name))
     return {name.removeprefix(prefix): float(chosen[name]) for name in names}
-
-
-def _mean_over_processes(row: Mapping[str, float]) -> dict[str, float]:
-    parts = gather(dict(row))
-    return {name: sum(part[name] for part in parts) / len(parts) for name in row}

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from l3r.train.csv_table import append_row, drop_rows_after
+from l3r.train.ranks import Agreement
 from l3r.train.run_log import DatasetMeans
 
 GRAPHS = st.lists(st.tuples(st.sampled_from(["a", "b/c", "d"]), st.integers(-9, 9)), min_size=1)
@@ -13,13 +14,13 @@ GRAPHS = st.lists(st.tuples(st.sampled_from(["a", "b/c", "d"]), st.integers(-9, 
 
 @given(GRAPHS, st.integers(1, 4))
 def test_means_of_data_sets_do_not_depend_on_how_graphs_came_in_batches(graphs, size):
-    means = DatasetMeans()
+    means = DatasetMeans(Agreement())
     for first in range(0, len(graphs), size):
         part = graphs[first : first + size]
         values = torch.tensor([float(value) for _, value in part])
         means.add([name for name, _ in part], {"loss": values, "error": 2 * values})
         # A checkpoint between any two batches changes nothing.
-        copy = DatasetMeans()
+        copy = DatasetMeans(Agreement())
         copy.load_state_dict(means.state_dict())
         means = copy
     found = means.take()
@@ -32,7 +33,7 @@ def test_means_of_data_sets_do_not_depend_on_how_graphs_came_in_batches(graphs, 
 
 
 def test_graphs_of_skipped_steps_do_not_count():
-    means = DatasetMeans()
+    means = DatasetMeans(Agreement())
     means.add(["a", "a", "b"], {"loss": torch.tensor([1.0, torch.nan, torch.inf])})
     means.add(["a"], {"loss": torch.tensor([2.0])})
     assert means.take() == {"a/loss": 1.5}
