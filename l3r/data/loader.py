@@ -138,15 +138,15 @@ def build_training_loader(
         share: Which graphs of each step are this device's.
 
     Raises:
-        ConfigError: There is no source, or the graphs of a step do not split over the devices.
+        ConfigError: There is no source, or a step has fewer graphs than devices and batches.
         DataError: A place holds no finished shards.
     """
     if not config.sources:
         raise ConfigError("data.sources is empty; add data.sources.NAME.shards=FOLDER")
     parts = share.world_size * share.accumulate
-    if config.graphs_per_step % parts:
+    if config.graphs_per_step < parts:
         raise ConfigError(
-            f"data.graphs_per_step is {config.graphs_per_step}, expected a multiple of {parts}: "
+            f"data.graphs_per_step is {config.graphs_per_step}, expected at least {parts}: "
             f"{share.world_size} devices, {share.accumulate} batches each"
         )
     if share.rank == 0:

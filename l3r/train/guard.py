@@ -10,9 +10,10 @@ from lightning.pytorch.callbacks import Callback
 from torch import Tensor, nn
 from torch.nn.utils import get_total_norm
 
+from l3r.config import RunConfig
 from l3r.errors import LaunchError
 from l3r.loss.joint import LossTerms
-from l3r.train.ranks import Agreement
+from l3r.train.ranks import Agreement, batch_weight
 from l3r.types import Views
 
 
@@ -20,15 +21,26 @@ class StepMean(Callback):
     """Logs the loss and its terms as means over all graphs of a step.
 
     Lightning would log those of the first process's last batch.
+
+    Args:
+        config: Of the run.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, config: RunConfig) -> None:
+        self.config = config
         self.batches: list[dict[str, Tensor]] = []
+        self.weight = 1.0
 
     def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Listen to what the loss gives in training."""
         loss = pl_module.get_submodule("loss")
         loss.register_forward_hook(self._collect)
+
+    def on_train_batch_start(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Views, batch_idx: int
+    ) -> None:
+        """Take the weight of the batch to come."""
+        self.weight = batch_weight(trainer, batch, self.config)
 
     def on_before_optimizer_step(
         self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: torch.optim.Optimizer
@@ -42,7 +54,8 @@ class StepMean(Callback):
 
     def _collect(self, loss: nn.Module, inputs: Any, terms: LossTerms) -> None:
         if loss.training:
-            self.batches.append(terms.scalars("train"))
+            row = terms.scalars("train")
+            self.batches.append({name: self.weight * value for name, value in row.items()})
 
 
 class GradientGuard(Callback):

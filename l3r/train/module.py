@@ -15,7 +15,7 @@ from l3r.loss.joint import JointLoss, LossTerms
 from l3r.metrics.cameras import CameraMetrics, camera_metrics, mean_metrics
 from l3r.model.light3r import Light3R
 from l3r.train.optim import build_optimizer, build_schedule
-from l3r.train.ranks import Agreement
+from l3r.train.ranks import Agreement, batch_weight
 from l3r.train.run_log import DatasetMeans
 from l3r.types import Prediction, Reconstruction, Views
 
@@ -45,13 +45,15 @@ class TrainModule(L.LightningModule):
         """Run one optimisation step's forward pass.
 
         Returns:
-            ``loss``, which lightning minimises, and ``graphs``, figures of each graph alone.
+            ``loss``, weighted by the batch's share of the step's graphs, which lightning averages
+            and minimises, and ``graphs``, figures of each graph alone.
         """
         prediction, terms = self._compare(batch)
         self.log_dict(terms.scalars("train"), batch_size=len(batch.key))
         facts = summarise_trees(prediction.tree) | self._confidence(prediction)
         self.log_dict({f"train/{name}": torch.as_tensor(x) for name, x in facts.items()})
-        return {"loss": terms.total, "graphs": terms.graphs}
+        weight = batch_weight(self.trainer, batch, self.config)
+        return {"loss": weight * terms.total, "graphs": terms.graphs}
 
     def validation_step(self, batch: Views, batch_idx: int) -> dict[str, Reconstruction]:
         """Log the loss of held-out graphs, and score their cameras by the full inference path.

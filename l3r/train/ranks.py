@@ -17,6 +17,7 @@ from lightning.pytorch.strategies import DDPStrategy, Strategy
 
 from l3r.config import RunConfig, TrainConfig
 from l3r.errors import ConfigError, L3RError, LaunchError
+from l3r.types import Views
 
 _PEER_FAILURE = re.compile(
     r"gloo|nccl|connection (reset|closed|refused)|timed out|broken pipe|rendezvous|socket", re.I
@@ -51,7 +52,7 @@ class Ranks:
         return SLURMEnvironment(auto_requeue=False) if self.is_srun else LightningEnvironment()
 
     def strategy(self, config: TrainConfig) -> Strategy | str:
-        """Build the strategy: gradients are averaged over equal shares of a step's graphs."""
+        """Build the strategy: gradients are averaged over processes; see :func:`batch_weight`."""
         if self.world_size == 1:
             return "auto"
         return DDPStrategy(
@@ -70,8 +71,8 @@ def find_ranks(config: RunConfig, env: Mapping[str, str] = os.environ) -> Ranks:
         env: Environment; srun tells each process its place there.
 
     Raises:
-        ConfigError: What srun started is not what the configuration asks for, or the graphs of a
-            step do not split over all.
+        ConfigError: What srun started is not what the configuration asks for, or a step has fewer
+            graphs than processes and batches.
     """
     train = config.train
     if int(env.get("SLURM_STEP_NUM_TASKS", "1")) > 1:
@@ -83,10 +84,10 @@ def find_ranks(config: RunConfig, env: Mapping[str, str] = os.environ) -> Ranks:
             rank=place[0] * devices + place[1], devices=devices, num_nodes=num_nodes, is_srun=False
         )
     parts = ranks.world_size * train.accumulate
-    if config.data.graphs_per_step % parts:
+    if config.data.graphs_per_step < parts:
         raise ConfigError(
-            f"data.graphs_per_step is {config.data.graphs_per_step}, expected a multiple of "
-            f"{parts}: {ranks.world_size} devices, train.accumulate={train.accumulate} batches each"
+            f"data.graphs_per_step is {config.data.graphs_per_step}, expected at least {parts}: "
+            f"{ranks.world_size} devices, train.accumulate={train.accumulate} batches each"
         )
     return ranks
 
@@ -140,6 +141,15 @@ class Agreement:
         values = [None] * dist.get_world_size(self._group)
         dist.all_gather_object(values, value, group=self._group)
         return values
+
+
+def batch_weight(trainer: L.Trainer, batch: Views, config: RunConfig) -> float:
+    """Weight of a batch's means in those of its step; 1 where all batches have as many graphs.
+
+    The mean of the weighted means, over the batches of all processes, is that over all graphs.
+    """
+    num_batches = trainer.world_size * trainer.accumulate_grad_batches
+    return len(batch.key) * num_batches / config.data.graphs_per_step
 
 
 def step_is_whole(trainer: L.Trainer, batch_idx: int) -> bool:

@@ -111,7 +111,7 @@ def _build_callbacks(
     folder = Path(train.output_dir)
     callbacks: list[Callback] = [
         RoomGradients(train.log_every),
-        StepMean(),
+        StepMean(config),
         GradientGuard(folder / "bad_steps.jsonl", train.max_bad_steps, agreement),
         StepTimer(),
         # On all processes, which give it their figures; the first one writes.

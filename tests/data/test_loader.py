@@ -256,8 +256,8 @@ def test_nothing_readable_stops_at_once(tmp_path):
 def test_requests_that_cannot_be_met_say_what_to_do(shards, tmp_path):
     with pytest.raises(ConfigError, match=r"data\.sources is empty"):
         loader(config())
-    with pytest.raises(ConfigError, match="multiple of 3: 3 devices"):
-        loader(config(shards), world_size=3)
+    with pytest.raises(ConfigError, match="at least 5: 5 devices"):
+        loader(config(shards), world_size=5)
     with pytest.raises(DataError, match=r"manifest\.json: no such file"):
         loader(config(tmp_path))
     small = write_folder(tmp_path / "small", [make_graph(0, num_views=2, height=16, width=16)])

@@ -90,6 +90,17 @@ def test_devices_and_batches_change_neither_samples_nor_losses_nor_weights(
 
 
 @pytest.mark.slow
+def test_shares_of_a_step_that_are_not_equal_weigh_by_their_graphs(hand_shards, tmp_path):
+    runs = tmp_path / "alone", tmp_path / "uneven"
+    for folder, train in zip(runs, ({}, {"devices": 2, "accumulate": 2}), strict=True):
+        launch(hand_shards, folder, "data.graphs_per_step=5", max_steps=6, lr=1e-3, **train)
+    one, other = (seen(folder)[0] for folder in runs)
+    assert one == other
+    assert {len(keys) for keys in one.values()} == {5}
+    assert_same_run(*runs[::-1])
+
+
+@pytest.mark.slow
 def test_a_loss_that_is_not_finite_in_one_process_skips_the_step_in_all(hand_shards, tmp_path):
     for name, env in (("bad", {"NAN_AT": "3:1"}), ("good", {})):
         told = launch(hand_shards, tmp_path / name, devices=2, max_steps=4, lr=1e-3, env=env)
@@ -156,8 +167,8 @@ def test_without_srun_there_is_one_process_unless_said():
     [
         ({"devices": 8}, SRUN, r"train\.devices=8, .*srun started 4 .*2 nodes"),
         ({}, SRUN | {"SLURM_STEP_TASKS_PER_NODE": "5,3"}, "--ntasks-per-node"),
-        ({"accumulate": 3}, {}, "expected a multiple of 3: 1 devices, train.accumulate=3"),
-        ({"devices": 3}, {}, "graphs_per_step is 8, expected a multiple of 3"),
+        ({"accumulate": 9}, {}, "expected at least 9: 1 devices, train.accumulate=9"),
+        ({"devices": 3, "accumulate": 3}, {}, "graphs_per_step is 8, expected at least 9"),
     ],
 )
 def test_processes_that_do_not_fit_are_refused(train, env, message):
