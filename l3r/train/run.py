@@ -109,14 +109,15 @@ def _build_callbacks(
 ) -> list[Callback]:
     train = config.train
     folder = Path(train.output_dir)
+    timer = StepTimer(train.log_every, config.data.graphs_per_step)
     callbacks: list[Callback] = [
         RoomGradients(train.log_every),
         StepMean(config),
         GradientGuard(folder / "bad_steps.jsonl", train.max_bad_steps, agreement),
-        StepTimer(),
+        timer,
         # On all processes, which give it their figures; the first one writes.
         RunLog(folder, train.log_every, agreement, sinks, pictures=config.logs.pictures),
-        StepProgress(),
+        StepProgress(timer),
     ]
     return [*callbacks, StepCheckpoint(folder / "last.ckpt", config, signals, agreement)]
 
