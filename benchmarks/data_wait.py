@@ -26,6 +26,8 @@ def main(argv: list[str]) -> int:
     parser.add_argument("layers", nargs="*", metavar="LAYER", help="of l3r train")
     parser.add_argument("--steps", type=int, default=200, help="steps to train (200)")
     args = parser.parse_intermixed_args(argv)
+    if args.steps < 2 * EVERY:
+        parser.error(f"--steps {args.steps}: expected {2 * EVERY} or more")
     with prepared(args.layers) as config:
         first, others = measure_wait(config, args.steps)
     print(f"{args.steps} steps, {config.data.num_workers} loader processes")
@@ -38,8 +40,8 @@ def measure_wait(config: RunConfig, steps: int) -> tuple[float, float]:
     """Train and read the share of time spent waiting for data.
 
     Args:
-        config: From :func:`benchmarks.train_step.prepared`; its last step's files are written.
-        steps: Optimisation steps, a multiple of ``EVERY`` and at least two of it.
+        config: From :func:`benchmarks.train_step.prepared`; its folder is written.
+        steps: Optimisation steps, at least two rows.
 
     Returns:
         That of the first row of the log, and the mean of the others, by their time.

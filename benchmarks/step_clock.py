@@ -125,6 +125,7 @@ class StepClock:
             self._marks.clear()
             self._phase.enter_context(count_waits(self.waits))
         if step == self.end:
+            self._phase.close()
             raise Enough
         if step == self.first:
             self._phase.enter_context(self._memory.stage("steps"))
