@@ -3,7 +3,8 @@
 python -m benchmarks.train_step                        # full size on a GPU, tiny on a CPU
 python -m benchmarks.train_step train.precision=fp32   # settings on top of that
 python -m benchmarks.train_step configs/base.yaml configs/model/l3r_224.yaml --steps 50
-python -m benchmarks.train_step --variants --rounds 3  # eager, compiled, checkpointed
+python -m benchmarks.train_step --variants             # eager, compiled, checkpointed, both
+python -m benchmarks.train_step --variants eager checkpointed --rounds 3
 
 Steps of the real ``l3r train``, as one device of the run that the layers describe takes them, with
 weights drawn at random, fed by its loader from shards that are made for it; all at the model's
@@ -54,7 +55,7 @@ VARIANTS = {
     "eager": (False, False),
     "compiled": (True, False),
     "checkpointed": (False, True),
-    "compiled, checkpointed": (True, True),
+    "both": (True, True),
 }
 """``train.compile`` and ``train.gradient_checkpointing``."""
 
@@ -93,10 +94,10 @@ def main(argv: list[str]) -> int:
             f"{config.data.graphs_per_step} graphs of {config.data.num_views} images of {size} a "
             f"step, {config.train.precision}, {args.steps} steps after {WARMUP}\n"
         )
-        if args.variants:
-            rows = _compare(config, args.steps, args.rounds)
-        else:
+        if args.variants is None:
             rows = describe(config, measure(config, args.steps))
+        else:
+            rows = _compare(config, args.variants or list(VARIANTS), args.steps, args.rounds)
         for label, value in rows:
             print(f"  {label:<44}{value:>32}", flush=True)
     return 0
@@ -126,7 +127,9 @@ def prepared(layers: Sequence[str]) -> Iterator[RunConfig]:
         config.data.validation = {}
         config.data.image_sizes = []
         own = config.train
-        config.data.graphs_per_step //= (own.devices or 1) * (own.num_nodes or 1)
+        # The most that a device of the run takes.
+        parts = (own.devices or 1) * (own.num_nodes or 1)
+        config.data.graphs_per_step = -(-config.data.graphs_per_step // parts)
         own.devices = own.num_nodes = 1
         own.init = ""
         own.output_dir = str(Path(temporary) / "run")
@@ -200,14 +203,17 @@ def step_flops(config: RunConfig) -> float:
     return config.data.graphs_per_step * sum(of_graph.values())
 
 
-def _compare(config: RunConfig, steps: int, rounds: int) -> Iterator[tuple[str, str]]:
-    """Take turns with the variants of one configuration."""
-    taken: dict[str, list[Measured]] = {name: [] for name in VARIANTS}
+def _compare(
+    config: RunConfig, names: Sequence[str], steps: int, rounds: int
+) -> Iterator[tuple[str, str]]:
+    """Take turns with variants of one configuration; ratios are to the first."""
+    taken: dict[str, list[Measured]] = {name: [] for name in names}
     for _ in range(rounds):
-        for name, (compiled, checkpointed) in VARIANTS.items():
+        for name, runs in taken.items():
+            compiled, checkpointed = VARIANTS[name]
             changed = {"compile": compiled, "gradient_checkpointing": checkpointed}
             variant = replace(config, train=replace(config.train, **changed))
-            taken[name].append(measure(variant, steps))
+            runs.append(measure(variant, steps))
     joined = {
         name: replace(
             runs[0],
@@ -216,11 +222,11 @@ def _compare(config: RunConfig, steps: int, rounds: int) -> Iterator[tuple[str, 
         )
         for name, runs in taken.items()
     }
-    eager = joined["eager"]
+    first = joined[names[0]]
     flops, rate = step_flops(config), matmul_rate(config.train.precision)
     for name, measured in joined.items():
         whole = measured.step_seconds
-        ratio = f"{whole / eager.step_seconds:.2f} of eager"
+        ratio = f"{whole / first.step_seconds:.2f} of {names[0]}"
         yield name, f"{1e3 * whole:.1f} ms, {ratio}"
         yield "  MFU by the data sheet", _share(flops / whole, _sheet_rate(config))
         yield "  MFU by the matmul rate", _share(flops / whole, rate)
@@ -257,7 +263,8 @@ def _parse(argv: list[str]) -> argparse.Namespace:
     add = parser.add_argument
     add("layers", nargs="*", metavar="LAYER", help="of l3r train; settings alone: on the default")
     add("--steps", type=int, default=20, help="steps to time (20)")
-    add("--variants", action="store_true", help="compare eager, compiled, checkpointed")
+    names = ", ".join(VARIANTS)
+    add("--variants", nargs="*", choices=VARIANTS, metavar="NAME", help=f"compare them: {names}")
     add("--rounds", type=int, default=1, help="turns of the variants (1)")
     return parser.parse_intermixed_args(argv)
 

@@ -126,7 +126,7 @@ def _build_trainer(
     config: RunConfig, ranks: Ranks, callbacks: list[Callback], files: CheckpointFiles
 ) -> L.Trainer:
     train = config.train
-    return L.Trainer(
+    trainer = L.Trainer(
         accelerator=train.accelerator,
         precision="bf16-mixed" if train.precision == "bf16" else "32-true",
         devices=ranks.devices,
@@ -150,6 +150,10 @@ def _build_trainer(
         use_distributed_sampler=False,
         log_every_n_steps=1,
     )
+    # Before every batch lightning asks all processes for SIGTERM, and waits for the device. Here
+    # StepCheckpoint asks, after whole steps, and nobody waits.
+    trainer.fit_loop.epoch_loop._broadcast_sigterm_tensor = lambda: None  # type: ignore[method-assign]
+    return trainer
 
 
 def _quieten_lightning() -> None:
