@@ -1,8 +1,6 @@
 """Graphs per second that the loader delivers from one core, and the stage that limits it.
 
-The images are views of a rendered room under a fractal texture and a little noise, since plain
-renderings compress better than photos: their JPEGs take about as many bytes as genuine ones (0.23
-to 0.52 bytes a pixel on five data sets, docs/data.md). Colours are jittered.
+The graphs are those of ``made_shards``. Colours are jittered.
 """
 
 import multiprocessing
@@ -12,25 +10,18 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 import torch
 
+from benchmarks.made_shards import write_shards
 from benchmarks.timing import stopwatch
-from data_prep.converters.synthetic import intrinsics
-from data_prep.raycast import render
-from data_prep.room import build_room, draw_cameras
-from data_prep.shards import relative_to_first
 from l3r.config import DataConfig, SourceConfig
 from l3r.data.loader import build_training_loader
-from l3r.data.schema import index_shard, write_index
 from l3r.data.steps import DeviceShare
-from tests.data.graphs import make_graph, write_folder
 from tests.data.range_server import serve
 
 STEPS, GRAPHS, VIEWS = 12, 4, 8
@@ -56,7 +47,7 @@ def run() -> list[tuple[str, str]]:
     """
     rows = []
     with tempfile.TemporaryDirectory() as temporary:
-        folder = _write_shards(Path(temporary))
+        folder = write_shards(Path(temporary) / "shards", GRAPHS, VIEWS, STORED)
         pixels = GRAPHS * VIEWS * STORED[0] * STORED[1]
         ratio = _bytes_of_images(folder) / pixels
         rows.append((f"images stored at {STORED[0]}x{STORED[1]}", f"{ratio:.2f} bytes a pixel"))
@@ -97,48 +88,6 @@ def _measure(
             each = f"{1e3 * seconds[stage] / number:.1f} ms {seconds[stage] / wall:>4.0%}"
             rows.append((f"    {stage}{note}", each))
     return rows
-
-
-def _write_shards(folder: Path) -> Path:
-    """Write graphs of the same rendered views in different orders, with their indices."""
-    room = build_room(0)
-    world_from_cam = draw_cameras(room, VIEWS, 0)
-    K = intrinsics(STORED)
-    rng = np.random.default_rng(0)
-    images, depths = [], []
-    for camera in world_from_cam:
-        image, depth = render(room, torch.from_numpy(K), camera[None], STORED)
-        images.append(_textured(image[0].numpy(), rng))
-        depths.append(depth[0].numpy())
-    graphs = []
-    for number in range(GRAPHS):
-        order = np.roll(np.arange(VIEWS), number)
-        cameras = world_from_cam.double().numpy()[order]
-        graphs.append(
-            replace(
-                make_graph(number, VIEWS, *STORED),
-                image=[images[view] for view in order],
-                depth=[depths[view] for view in order],
-                K=np.tile(K, (VIEWS, 1, 1)),
-                cam_from_world=relative_to_first(cameras),
-            )
-        )
-    written = write_folder(folder / "shards", graphs)
-    for tar in written.glob("*.tar"):
-        write_index(tar, index_shard(tar))
-    return written
-
-
-def _textured(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Multiply a rendering by a texture whose amplitude falls with frequency as photos' do."""
-    height, width = image.shape[:2]
-    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width))
-    frequency[0, 0] = np.inf
-    spectrum = np.fft.rfft2(rng.normal(size=(height, width))) / frequency
-    texture = np.fft.irfft2(spectrum, s=(height, width))
-    shaded = image * (1 + 0.07 * texture / texture.std())[..., None]
-    noisy = 255 * shaded + rng.normal(scale=0.5, size=image.shape)
-    return np.clip(noisy, 0, 255).astype(np.uint8)
 
 
 def _bytes_of_images(folder: Path) -> int:

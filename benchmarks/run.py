@@ -9,7 +9,7 @@ import sys
 
 import torch
 
-ALL = ("startup", "accumulate", "model", "loader", "sampling", "street", "data_prep")
+ALL = ("startup", "accumulate", "model", "train_step", "loader", "sampling", "street", "data_prep")
 
 
 def main(names: list[str]) -> int:

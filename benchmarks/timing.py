@@ -4,7 +4,7 @@ import statistics
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import wraps
 from pkgutil import resolve_name
 from typing import Any
@@ -41,17 +41,38 @@ def stopwatch(stages: Mapping[str, Sequence[str]]) -> Iterator[Counter[str]]:
     spent: Counter[str] = Counter()
     under_way: list[str] = []
 
-    def timed(stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    @contextmanager
+    def timed(stage: str) -> Iterator[None]:
+        if under_way:
+            yield
+            return
+        under_way.append(stage)
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            spent[under_way.pop()] += time.perf_counter() - start
+
+    with surrounded(stages, timed):
+        yield spent
+
+
+@contextmanager
+def surrounded(
+    stages: Mapping[str, Sequence[str]], around: Callable[[str], AbstractContextManager[None]]
+) -> Iterator[None]:
+    """Let every call of some functions run inside a context of its stage.
+
+    Args:
+        stages: Full names of the functions of each stage, where they are looked up.
+        around: Makes the context from the name of the stage.
+    """
+
+    def inside(stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(function)
         def call(*args: Any, **kwargs: Any) -> Any:
-            if under_way:
+            with around(stage):
                 return function(*args, **kwargs)
-            under_way.append(stage)
-            start = time.perf_counter()
-            try:
-                return function(*args, **kwargs)
-            finally:
-                spent[under_way.pop()] += time.perf_counter() - start
 
         return call
 
@@ -60,9 +81,9 @@ def stopwatch(stages: Mapping[str, Sequence[str]]) -> Iterator[Counter[str]]:
             for name in names:
                 owner, _, attribute = name.rpartition(".")
                 home = resolve_name(owner)
-                timer = timed(stage, getattr(home, attribute))
-                stack.enter_context(patch.object(home, attribute, timer))
-        yield spent
+                call = inside(stage, getattr(home, attribute))
+                stack.enter_context(patch.object(home, attribute, call))
+        yield
 
 
 def _wait() -> None:

@@ -7,6 +7,7 @@ resumed run goes on with the very next sample whatever the workers had read ahea
 import logging
 import signal
 import threading
+import time
 from collections import deque
 from collections.abc import Iterator
 from typing import Any, TypeVar
@@ -90,6 +91,8 @@ class StepLoader:
         self.num_batches = num_steps * dataset.share.accumulate
         self.pin_memory = pin_memory
         self.batch = 0
+        self.waited = 0.0
+        """Seconds for which batches have kept their taker waiting so far."""
 
     def __iter__(self) -> Iterator[Views]:
         """Yield batches from the current step.
@@ -100,6 +103,7 @@ class StepLoader:
         """
         guard = SkipGuard(self.config.max_skip_rate)
         numbers = range(self.batch, self.num_batches)
+        asked = time.perf_counter()
         for batch in read_ahead(self.dataset, numbers, self.config, pin_memory=self.pin_memory):
             views = batch.unpack()
             if views is None:
@@ -109,7 +113,9 @@ class StepLoader:
                 )
             guard.count(len(views.key), batch.skipped)
             self.batch += 1
+            self.waited += time.perf_counter() - asked
             yield views
+            asked = time.perf_counter()
 
     def state_dict(self) -> dict[str, Any]:
         """Everything a resumed run needs; a step begun is begun again."""

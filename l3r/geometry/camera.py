@@ -68,7 +68,8 @@ def unproject(
     height, width = depth.shape[-2:]
     pts2d = pixel_centers(height, width, like=depth)
     homogeneous = torch.cat([pts2d, torch.ones_like(pts2d[:, :1])], dim=-1)
-    rays: Tensor = homogeneous @ torch.linalg.inv(K).transpose(-1, -2)
+    # The plain inverse would wait for the device to learn whether there is one.
+    rays: Tensor = homogeneous @ torch.linalg.inv_ex(K).inverse.transpose(-1, -2)
     return rays * depth.flatten(-2)[..., None]
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import lightning as L
 import torch
+import torch.distributed as dist
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor, nn
 from torch.nn.utils import get_total_norm
@@ -48,7 +49,10 @@ class StepMean(Callback):
         """Log the means, under the names of the module's own figures."""
         names = list(self.batches[0])
         rows = torch.stack([torch.stack([row[name] for name in names]) for row in self.batches])
-        means = trainer.strategy.reduce(rows.mean(dim=0), reduce_op="mean")
+        means = rows.mean(dim=0)
+        if trainer.world_size > 1:  # by torch: lightning's way has a barrier, which waits
+            dist.all_reduce(means)
+            means = means / trainer.world_size
         pl_module.log_dict(dict(zip(names, means, strict=True)))
         self.batches.clear()
 

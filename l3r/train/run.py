@@ -109,14 +109,15 @@ def _build_callbacks(
 ) -> list[Callback]:
     train = config.train
     folder = Path(train.output_dir)
+    timer = StepTimer(train.log_every, config.data.graphs_per_step)
     callbacks: list[Callback] = [
         RoomGradients(train.log_every),
         StepMean(config),
         GradientGuard(folder / "bad_steps.jsonl", train.max_bad_steps, agreement),
-        StepTimer(),
+        timer,
         # On all processes, which give it their figures; the first one writes.
         RunLog(folder, train.log_every, agreement, sinks, pictures=config.logs.pictures),
-        StepProgress(),
+        StepProgress(timer),
     ]
     return [*callbacks, StepCheckpoint(folder / "last.ckpt", config, signals, agreement)]
 
@@ -125,7 +126,7 @@ def _build_trainer(
     config: RunConfig, ranks: Ranks, callbacks: list[Callback], files: CheckpointFiles
 ) -> L.Trainer:
     train = config.train
-    return L.Trainer(
+    trainer = L.Trainer(
         accelerator=train.accelerator,
         precision="bf16-mixed" if train.precision == "bf16" else "32-true",
         devices=ranks.devices,
@@ -149,6 +150,10 @@ def _build_trainer(
         use_distributed_sampler=False,
         log_every_n_steps=1,
     )
+    # Before every batch lightning asks all processes for SIGTERM, and waits for the device. Here
+    # StepCheckpoint asks, after whole steps, and nobody waits.
+    trainer.fit_loop.epoch_loop._broadcast_sigterm_tensor = lambda: None  # type: ignore[method-assign]
+    return trainer
 
 
 def _quieten_lightning() -> None:

@@ -122,8 +122,7 @@ class RunLog(Callback):
         """Write a training row, once a step however many batches it has."""
         self.datasets.add(batch.dataset, outputs["graphs"])
         step = trainer.global_step
-        is_due = step % self.every == 0 or step == trainer.max_steps
-        if not is_due or not step_is_whole(trainer, batch_idx):
+        if not row_is_due(trainer, step, self.every) or not step_is_whole(trainer, batch_idx):
             return
         row = {"lr": float(trainer.optimizers[0].param_groups[0]["lr"])}
         own = _numbers(trainer.callback_metrics, "train/")
@@ -184,6 +183,11 @@ class RunLog(Callback):
         append_row(path, {"step": float(step), **row})
         for sink in self.sinks:
             sink.write(step, {f"{kind}/{name}": value for name, value in row.items()})
+
+
+def row_is_due(trainer: L.Trainer, step: int, every: int) -> bool:
+    """Tell whether a training row is written after a step: every so many, and after the last."""
+    return step % every == 0 or step == trainer.max_steps
 
 
 def write_machine(path: Path, trainer: L.Trainer) -> None:

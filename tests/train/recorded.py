@@ -10,14 +10,28 @@ import os
 import signal
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 
 import torch
+import torch.distributed as dist
 
 from l3r.cli.main import main
 from l3r.train.module import TrainModule
 
 _step = TrainModule.training_step
+COLLECTIVES = Counter()
+"""Calls so far of what makes the host wait for a device if the processes meet over NCCL."""
+
+
+def counted(name):
+    function = getattr(dist, name)
+
+    def call(*args, **kwargs):
+        COLLECTIVES[name] += 1
+        return function(*args, **kwargs)
+
+    return call
 
 
 def training_step(self, batch, batch_idx):
@@ -25,6 +39,7 @@ def training_step(self, batch, batch_idx):
     step, rank = self.trainer.global_step + 1, self.trainer.global_rank
     if folder := os.environ.get("RECORD"):
         row = {"step": step, "keys": batch.key, "size": list(batch.image.shape)}
+        row["collectives"] = COLLECTIVES.total()
         with (Path(folder) / f"{rank}.jsonl").open("a") as stream:
             stream.write(json.dumps(row) + "\n")
     here = f"{step}:{rank}"
@@ -38,6 +53,7 @@ def training_step(self, batch, batch_idx):
 
 
 TrainModule.training_step = training_step
+dist.barrier, dist.broadcast = counted("barrier"), counted("broadcast")
 
 if __name__ == "__main__":
     sys.exit(main(["train", *sys.argv[1:]]))

@@ -87,6 +87,9 @@ def test_devices_and_batches_change_neither_samples_nor_losses_nor_weights(
     assert num_processes == devices
     assert steps == seen(alone)[0]
     assert_same_run(tmp_path, alone)
+    rows = map(json.loads, (tmp_path / "seen" / "0.jsonl").read_text().splitlines())
+    # After the fifth comes a checkpoint, which all wait for.
+    assert len({row["collectives"] for row in rows if row["step"] <= 5}) == 1
 
 
 @pytest.mark.slow
