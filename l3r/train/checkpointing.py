@@ -109,7 +109,7 @@ class StepCheckpoint(Checkpoint):
     ) -> None:
         self.path = path
         self.config = config.train
-        self.has_validation = bool(config.data.validation)
+        self.has_validation = bool(config.data.validation and config.train.validation_graphs)
         self.signals = signals
         self.agreement = agreement
         self.saved_at = 0.0

@@ -27,7 +27,7 @@ def in_the_repository(monkeypatch):
 def launch(shards, folder, *settings, code=0, env=None, **train):
     """Train in processes of their own; they write down what they see in ``folder/seen``."""
     (folder / "seen").mkdir(parents=True, exist_ok=True)
-    changes = layers(shards, folder, validate_every=100, **train)
+    changes = layers(shards, folder, **{"validate_every": 100, **train})
     done = subprocess.run(
         [sys.executable, "-m", "tests.train.recorded", *changes, *settings],
         env={**os.environ, "RECORD": str(folder / "seen"), **(env or {})},
