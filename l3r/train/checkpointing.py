@@ -36,6 +36,7 @@ FREE_TO_CHANGE = {
     "train.gradient_checkpointing",
     "train.init",
     "train.log_every",
+    "train.max_bad_steps",
     "train.note",
     "train.num_nodes",
     "train.output_dir",
