@@ -250,12 +250,15 @@ def test_a_resumed_run_may_take_its_steps_in_other_batches(
 @pytest.mark.slow
 def test_a_run_of_two_processes_resumes_to_the_last_bit(hand_shards, tmp_path):
     straight, stopped = tmp_path / "straight", tmp_path / "stopped"
-    options = {"devices": 2, "lr": 1e-3, "checkpoint_every": 2}
+    # Rows of three steps: the sums of a row that the checkpoint of step 2 cuts in two go on as well.
+    options = {"devices": 2, "lr": 1e-3, "checkpoint_every": 2, "log_every": 3}
     launch(hand_shards, straight, FOUR, max_steps=6, **options)
     died = {"DIE_AT": "4:1"}
     launch(hand_shards, stopped, FOUR, max_steps=6, **options, env=died, code=2)
     launch(hand_shards, stopped, FOUR, max_steps=6, **options)
     assert_equal_to_the_last_bit(stopped, straight)
+    sums = [[(row["step"], row["hand/loss"]) for row in read_log(f)] for f in (stopped, straight)]
+    assert sums[0] == sums[1]
 
 
 def test_what_may_change_at_resume_exists():

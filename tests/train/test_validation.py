@@ -1,10 +1,8 @@
 """Validation is shared out over the processes, and what it finds does not depend on how many."""
 
 import dataclasses
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 from pathlib import Path
-from threading import Barrier
 
 import pytest
 import torch
@@ -16,12 +14,12 @@ from l3r.data.source import ShardFolder
 from l3r.loss.joint import LossTerms
 from l3r.metrics.cameras import CameraMetrics
 from l3r.train.datamodule import ValidationGraphs, ValidationShare
-from l3r.train.ranks import Agreement
 from l3r.train.run import train
 from l3r.train.validation import ValidationScores
 from tests.data.graphs import make_graph, write_folder
 from tests.train.runs import layers, read_log
 from tests.train.test_ranks import launch
+from tests.train.threads import run_together
 
 ROOT = Path(__file__).parents[2]
 STILL = {"lr": 1e-30, "weight_decay": 0, "max_steps": 2, "validate_every": 2}
@@ -41,28 +39,14 @@ def other_shards(tmp_path_factory):
     return write_folder(tmp_path_factory.mktemp("other"), named)
 
 
-class Threads(Agreement):
-    """Processes are threads here: each gets the values of all once all have come."""
-
-    def __init__(self, rank, parts, barrier):
-        super().__init__()
-        self.rank, self.parts, self.barrier = rank, parts, barrier
-
-    def gather(self, value):
-        self.parts[self.rank] = value
-        self.barrier.wait(timeout=10)
-        return list(self.parts)
-
-
 NUMBERS = st.floats(-1e6, 1e6) | st.just(float("nan"))
 
 
 def score(graphs, world_size):
     """The means that each process gets; a graph is a data set and a number."""
-    parts, barrier = [None] * world_size, Barrier(world_size)
 
-    def run(rank):
-        scores = ValidationScores(Threads(rank, parts, barrier))
+    def run(rank, agreement):
+        scores = ValidationScores(agreement)
         for name, value in graphs[rank::world_size]:
             total = torch.tensor(value, dtype=torch.float64)
             terms = LossTerms(total=total, parts={"pair_error": total / 3}, graphs={})
@@ -70,8 +54,7 @@ def score(graphs, world_size):
             scores.add(name, terms, cameras)
         return scores.take()
 
-    with ThreadPoolExecutor(world_size) as pool:
-        return list(pool.map(run, range(world_size)))
+    return run_together(run, world_size)
 
 
 @given(st.lists(st.tuples(st.sampled_from("abc"), NUMBERS), min_size=1), st.integers(1, 6))
