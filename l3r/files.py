@@ -61,6 +61,21 @@ def write_first(path: Path, data: bytes) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def append_whole(path: Path, text: str) -> None:
+    """Add text to a file, or leave the file as it was: a disk that fills up takes part of it."""
+    data = text.encode()
+    # No buffer: what it could not get rid of it would try again when closed.
+    with path.open("ab", buffering=0) as stream:
+        before = stream.tell()
+        try:
+            while data:
+                data = data[stream.write(data) :]
+        except OSError as error:
+            stream.truncate(before)
+            error.filename = error.filename or str(path)
+            raise
+
+
 def explain_failure(error: OSError) -> str:
     """Say what failed on a disk and what to do, in one line."""
     is_full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)

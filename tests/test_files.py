@@ -1,8 +1,10 @@
+import errno
 import os
+import resource
 
 import pytest
 
-from l3r.files import atomic_path, write_atomic
+from l3r.files import append_whole, atomic_path, write_atomic
 
 
 def test_a_file_is_replaced_as_a_whole(tmp_path):
@@ -35,3 +37,20 @@ def test_others_may_read_the_file_as_the_umask_says(tmp_path):
     finally:
         os.umask(before)
     assert (tmp_path / "a").stat().st_mode & 0o777 == 0o644
+
+
+def test_a_line_is_added_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "log.csv"
+    append_whole(path, "größer,1\n")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    # The kernel takes the first bytes of the next line and refuses the others, as a full disk does.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 4, before[1]))
+    try:
+        with pytest.raises(OSError, match=r"log\.csv") as error:
+            append_whole(path, "a,2\n" * 100)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert error.value.errno == errno.EFBIG
+    assert path.read_bytes() == "größer,1\n".encode()
+    append_whole(path, "b,3\n")
+    assert path.read_text() == "größer,1\nb,3\n"

@@ -13,8 +13,9 @@ from torch.nn.utils import get_total_norm
 
 from l3r.config import RunConfig
 from l3r.errors import LaunchError
-from l3r.files import write_atomic
+from l3r.files import append_whole, write_atomic
 from l3r.loss.joint import LossTerms
+from l3r.train.csv_table import bear_loss_of
 from l3r.train.ranks import Agreement, batch_weight
 from l3r.types import Views
 
@@ -111,8 +112,8 @@ class GradientGuard(Callback):
         step = trainer.global_step + 1
         row = {"step": step, "loss": str(float(loss)), "grad_norm": str(float(norm))}
         if trainer.is_global_zero:
-            with self.path.open("a") as stream:
-                stream.write(json.dumps({**row, "keys": keys}) + "\n")
+            with bear_loss_of(f"the row of bad step {step}"):
+                append_whole(self.path, json.dumps({**row, "keys": keys}) + "\n")
         self._count(row)
 
     def state_dict(self) -> dict[str, Any]:

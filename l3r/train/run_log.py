@@ -16,7 +16,7 @@ from torch import Tensor
 
 from l3r.export.graph_sheet import write_graph_sheet
 from l3r.files import write_atomic
-from l3r.train.csv_table import append_row, drop_rows_after
+from l3r.train.csv_table import append_row, bear_loss_of, drop_rows_after
 from l3r.train.ranks import Agreement, step_is_whole
 from l3r.train.sinks import Sink
 from l3r.types import Views
@@ -163,10 +163,11 @@ class RunLog(Callback):
             return
         step = trainer.global_step
         path = self.folder / "pictures" / f"step_{step:06d}.png"
-        path.parent.mkdir(exist_ok=True)
-        write_graph_sheet(path, outputs["scene"], batch)
-        for sink in self.sinks:
-            sink.add_picture(step, path)
+        with bear_loss_of(f"the picture of step {step}"):
+            path.parent.mkdir(exist_ok=True)
+            write_graph_sheet(path, outputs["scene"], batch)
+            for sink in self.sinks:
+                sink.add_picture(step, path)
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Write a validation row."""
@@ -201,9 +202,11 @@ class RunLog(Callback):
             return
         step = trainer.global_step
         path = self.training if kind == "train" else self.validation
-        append_row(path, {"step": float(step), **row})
+        with bear_loss_of(f"the row of step {step} in {path.name}"):
+            append_row(path, {"step": float(step), **row})
         for sink in self.sinks:
-            sink.write(step, {f"{kind}/{name}": value for name, value in row.items()})
+            with bear_loss_of(f"the row of step {step} in {type(sink).__name__}"):
+                sink.write(step, {f"{kind}/{name}": value for name, value in row.items()})
 
 
 def write_machine(path: Path, trainer: L.Trainer) -> None:

@@ -1,10 +1,13 @@
 """``l3r train`` that writes down what each process sees, and spoils or ends what a test names.
 
 Run it as ``python -m tests.train.recorded LAYERS``. In the environment: ``RECORD`` is a folder;
-``NAN_AT=STEP:RANK`` makes the loss of a step not finite in one process; ``DIE_AT`` kills the
-process there, ``HANG_AT`` stops it.
+``NAN_AT=STEP:RANK,...`` makes the loss of a step not finite in one process; ``DIE_AT`` kills the
+process there, ``TERM_AT`` sends it SIGTERM, ``HANG_AT`` stops it. ``FULL=STEP:STEP:FOLDER`` leaves
+no room on the disk of a folder from one step on and frees it in the other. ``DIE_IN_SAVE=STEP``
+kills the process with half of that step's checkpoint written.
 """
 
+import io
 import json
 import os
 import signal
@@ -18,6 +21,37 @@ from l3r.cli.main import main
 from l3r.train.module import TrainModule
 
 _step = TrainModule.training_step
+_save = torch.save
+
+
+def is_named(name, here):
+    return here in os.environ.get(name, "").split(",")
+
+
+def set_room(step):
+    first, last, folder = os.environ["FULL"].split(":")
+    filler = Path(folder) / "filler"
+    if step == int(last):
+        filler.unlink()
+    if step != int(first):
+        return
+    with filler.open("wb", buffering=0) as stream:
+        for size in (1 << 16, 1):
+            try:
+                while True:
+                    stream.write(b"0" * size)
+            except OSError:
+                continue
+
+
+def save(content, stream):
+    if content.get("global_step") != int(os.environ.get("DIE_IN_SAVE", "-1")):
+        return _save(content, stream)
+    whole = io.BytesIO()
+    _save(content, whole)
+    stream.write(whole.getvalue()[: whole.tell() // 2])
+    stream.flush()
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def training_step(self, batch, batch_idx):
@@ -28,16 +62,21 @@ def training_step(self, batch, batch_idx):
         with (Path(folder) / f"{rank}.jsonl").open("a") as stream:
             stream.write(json.dumps(row) + "\n")
     here = f"{step}:{rank}"
-    if os.environ.get("DIE_AT") == here:
+    if is_named("DIE_AT", here):
         os.kill(os.getpid(), signal.SIGKILL)
-    if os.environ.get("HANG_AT") == here:
+    if is_named("TERM_AT", here):
+        os.kill(os.getpid(), signal.SIGTERM)
+    if is_named("HANG_AT", here):
         time.sleep(600)
+    if "FULL" in os.environ:
+        set_room(step)
     # After the loss was computed: its gradient is what must not reach the weights.
-    is_bad = os.environ.get("NAN_AT") == here
+    is_bad = is_named("NAN_AT", here)
     return {**outputs, "loss": outputs["loss"] * torch.nan} if is_bad else outputs
 
 
 TrainModule.training_step = training_step
+torch.save = save
 
 if __name__ == "__main__":
     sys.exit(main(["train", *sys.argv[1:]]))
