@@ -46,7 +46,8 @@ def set_room(step):
 
 def save(content, stream):
     if content.get("global_step") != int(os.environ.get("DIE_IN_SAVE", "-1")):
-        return _save(content, stream)
+        _save(content, stream)
+        return
     whole = io.BytesIO()
     _save(content, whole)
     stream.write(whole.getvalue()[: whole.tell() // 2])

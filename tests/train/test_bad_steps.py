@@ -53,7 +53,7 @@ def test_bad_steps_in_a_row_are_counted_over_a_resume(hand_shards, tmp_path, spo
     with pytest.raises(KeyError, match="gone"):
         run(hand_shards, tmp_path)
     spoil({2, 3, 4})
-    with pytest.raises(LaunchError, match="step 4: .*3 such steps in a row"):
+    with pytest.raises(LaunchError, match=r"step 4: .*3 such steps in a row"):
         run(hand_shards, tmp_path)
     assert listed(tmp_path) == [2, 3, 4]
 
