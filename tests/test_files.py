@@ -4,7 +4,7 @@ import resource
 
 import pytest
 
-from l3r.files import append_whole, atomic_path, write_atomic
+from l3r.files import append_whole, atomic_path, hidden_sibling, hidden_siblings, write_atomic
 
 
 def test_a_file_is_replaced_as_a_whole(tmp_path):
@@ -28,6 +28,18 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
         interrupted()
     assert path.read_bytes() == b"old"
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.bin"]
+
+
+@pytest.mark.parametrize("name", ["last.ckpt", ".hidden", "[a]*.bin"])
+def test_what_a_kill_leaves_is_found_also_of_a_temporary_file(tmp_path, name):
+    path = tmp_path / name
+    once = hidden_sibling(path)
+    left = [once, hidden_sibling(once), hidden_sibling(hidden_sibling(once))]
+    for leftover in left:
+        leftover.touch()
+    path.touch()
+    hidden_sibling(tmp_path / "b.bin").touch()
+    assert hidden_siblings(path) == sorted(left)
 
 
 def test_others_may_read_the_file_as_the_umask_says(tmp_path):

@@ -2,14 +2,15 @@
 
 Run it as ``python -m tests.train.recorded LAYERS``. In the environment: ``RECORD`` is a folder;
 ``NAN_AT=STEP:RANK,...`` makes the loss of a step not finite in one process; ``DIE_AT`` kills the
-process there, ``TERM_AT`` sends it SIGTERM, ``HANG_AT`` stops it. ``FULL=STEP:STEP:FOLDER`` leaves
-no room on the disk of a folder from one step on and frees it in the other. ``DIE_IN_SAVE=STEP``
-kills the process with half of that step's checkpoint written.
+process there, ``TERM_AT`` sends it SIGTERM, ``HANG_AT`` stops it. ``FULL=STEP:STEP`` leaves no
+room on any disk from one step on, up to the other. ``DIE_IN_SAVE=STEP`` kills the process with half
+of that step's checkpoint written.
 """
 
 import io
 import json
 import os
+import resource
 import signal
 import sys
 import time
@@ -29,19 +30,11 @@ def is_named(name, here):
 
 
 def set_room(step):
-    first, last, folder = os.environ["FULL"].split(":")
-    filler = Path(folder) / "filler"
-    if step == int(last):
-        filler.unlink()
-    if step != int(first):
-        return
-    with filler.open("wb", buffering=0) as stream:
-        for size in (1 << 16, 1):
-            try:
-                while True:
-                    stream.write(b"0" * size)
-            except OSError:
-                continue
+    """The kernel refuses to let any file grow, as a full disk does."""
+    first, last = map(int, os.environ["FULL"].split(":"))
+    if step in (first, last):
+        limit = 1 if step == first else resource.RLIM_INFINITY
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
 
 
 def save(content, stream):
