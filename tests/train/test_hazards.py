@@ -87,7 +87,7 @@ def test_graphs_with_few_valid_pixels_leave_no_parameter_without_a_gradient(num_
 
 
 def test_points_that_fall_into_one_leave_every_gradient_finite():
-    """The fits between maps without extent have no answer, and their SVD no gradient."""
+    """A fit between maps without extent has no answer, and of a naive one no gradient is finite."""
     model = build()
     with torch.no_grad():
         for name, parameter in model.named_parameters():
