@@ -44,6 +44,7 @@ def own_shards(hand_shards, tmp_path):
     return Path(shutil.copytree(hand_shards, tmp_path / "shards"))
 
 
+@pytest.mark.slow
 def test_a_shard_that_is_damaged_in_a_run_is_replaced_sample_by_sample(
     own_shards, tmp_path, call_at, caplog
 ):
@@ -63,6 +64,7 @@ def test_a_shard_that_is_damaged_in_a_run_is_replaced_sample_by_sample(
     assert "sample skipped (1 so far): shards/hand-000001.tar:hand-00000" in caplog.text
 
 
+@pytest.mark.slow
 def test_a_run_over_the_rate_of_damaged_samples_stops_and_goes_on_once_they_are_mended(
     own_shards, hand_shards, finished, tmp_path, call_at
 ):

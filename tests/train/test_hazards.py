@@ -57,6 +57,7 @@ def test_the_length_of_the_schedule_is_never_asked_of_the_trainer(
         train(load_config(layers(hand_shards, tmp_path, **settings)))
 
 
+@pytest.mark.slow
 def test_torchs_generators_change_nothing_that_is_learnt(hand_shards, finished, tmp_path, call_at):
     """A resumed run finds them in another state, and lightning restores none."""
     call_at(4, lambda: torch.manual_seed(99))
@@ -116,7 +117,10 @@ def test_processes_with_and_without_valid_pixels_wait_for_no_gradient(tmp_path):
     assert not (tmp_path / "run" / "bad_steps.jsonl").exists()
 
 
-@pytest.mark.parametrize("scontrol", [None, "#!/bin/sh\necho 'no such job' >&2\nexit 1\n"])
+REFUSES = "#!/bin/sh\necho 'no such job' >&2\nexit 1\n"
+
+
+@pytest.mark.parametrize("scontrol", [None, pytest.param(REFUSES, marks=pytest.mark.slow)])
 def test_a_job_that_cannot_be_requeued_has_saved_and_goes_on(
     hand_shards, finished, tmp_path, call_at, monkeypatch, scontrol
 ):
