@@ -10,13 +10,17 @@ from pathlib import Path
 
 
 def hidden_sibling(path: Path) -> Path:
-    """Name an unused hidden path in the same folder, hence on the same file system."""
-    return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    """Name an unused hidden path in the same folder, hence on the same file system.
+
+    Of a hidden path too: what is written beside such a one counts as its file's.
+    """
+    name = path.name.lstrip(".")
+    return path.with_name(f".{name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
 
 
 def hidden_siblings(path: Path) -> list[Path]:
     """List what processes that were killed left of a file: names of :func:`hidden_sibling`."""
-    return sorted(path.parent.glob(f".{escape(path.name)}.*.tmp"))
+    return sorted(path.parent.glob(f".{escape(path.name.lstrip('.'))}.*.tmp"))
 
 
 @contextmanager
@@ -59,6 +63,21 @@ def write_first(path: Path, data: bytes) -> None:
         raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def append_whole(path: Path, text: str) -> None:
+    """Add text to a file, or leave the file as it was: a disk that fills up takes part of it."""
+    data = text.encode()
+    # No buffer: what it could not get rid of it would try again when closed.
+    with path.open("ab", buffering=0) as stream:
+        before = stream.tell()
+        try:
+            while data:
+                data = data[stream.write(data) :]
+        except OSError as error:
+            stream.truncate(before)
+            error.filename = error.filename or str(path)
+            raise
 
 
 def explain_failure(error: OSError) -> str:

@@ -123,6 +123,13 @@ def test_texts_name_files_that_exist(path):
             assert (path.parent / target).exists(), target
 
 
+def test_tests_that_texts_name_exist():
+    written = {f.name for path in SOURCES for f in functions(path)}
+    named = {test for path in TEXTS for test in re.findall(r"`(test_\w+)`", path.read_text())}
+    assert named
+    assert not named - written
+
+
 @pytest.mark.slow
 def test_the_wheel_holds_every_package_and_imports(tmp_path):
     build = [sys.executable, "-m", "build", "--wheel", "--outdir", str(tmp_path), str(ROOT)]

@@ -45,7 +45,7 @@ class TrainConfig:
     validate_every: int = 1000
     """Steps between validations."""
     validation_graphs: int = 32
-    """Graphs of each validation."""
+    """Graphs of each place of ``data.validation``, the same at every validation; 0: none."""
     log_every: int = 50
     """Steps between rows of ``metrics.csv``."""
     accelerator: Literal["auto", "cpu", "gpu"] = "auto"

@@ -36,6 +36,7 @@ FREE_TO_CHANGE = {
     "train.gradient_checkpointing",
     "train.init",
     "train.log_every",
+    "train.max_bad_steps",
     "train.note",
     "train.num_nodes",
     "train.output_dir",
@@ -109,7 +110,7 @@ class StepCheckpoint(Checkpoint):
     ) -> None:
         self.path = path
         self.config = config.train
-        self.has_validation = bool(config.data.validation)
+        self.has_validation = bool(config.data.validation and config.train.validation_graphs)
         self.signals = signals
         self.agreement = agreement
         self.saved_at = 0.0

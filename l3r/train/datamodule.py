@@ -1,10 +1,11 @@
 """Loaders for the trainer, on the device that asks."""
 
 import logging
+from collections.abc import Iterator, Sequence
 
 import lightning as L
 import torch
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, IterableDataset
 
 from l3r.config import RunConfig
 from l3r.data.loader import StepLoader, build_training_loader
@@ -18,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 class ShardData(L.LightningDataModule):
-    """Training batches by step, validation graphs one by one.
+    """Training batches by step, validation graphs one by one, shared out over the processes.
 
     Args:
         config: The whole run.
@@ -47,35 +48,40 @@ class ShardData(L.LightningDataModule):
         )
 
     def val_dataloader(self) -> DataLoader[Views] | list[DataLoader[Views]]:
-        """Build the loader of the validation graphs; none without validation shards."""
-        data = self.config.data
-        if not data.validation:
+        """Build the loader of this process's validation graphs; none where nothing is validated."""
+        trainer = self.trainer
+        assert trainer is not None
+        data, num_graphs = self.config.data, self.config.train.validation_graphs
+        if not data.validation or not num_graphs:
             return []
         size = self.config.model.image_size
-        dataset = ValidationGraphs(
-            open_folders(data.validation, data),
-            (size[0], size[1]),
-            self.config.train.validation_graphs,
-        )
-        return DataLoader(dataset, batch_size=None, pin_memory=torch.cuda.is_available())
+        folders = open_folders(data.validation, data)
+        graphs = ValidationGraphs(folders, (size[0], size[1]), num_graphs)
+        share = ValidationShare(graphs, trainer.global_rank, trainer.world_size)
+        return DataLoader(share, batch_size=None, pin_memory=torch.cuda.is_available())
 
 
 class ValidationGraphs(Dataset[Views]):
-    """The same graphs every time, spread evenly over all validation shards.
+    """The same graphs every time: as many of each place, spread evenly over it.
+
+    Those of one place depend on nothing else, so that another data set beside it leaves its curve
+    alone.
 
     Args:
         folders: Validation shards.
         image_size: (height, width).
-        num_graphs: Graphs at most.
+        num_graphs: Graphs of each folder; all of one that has fewer.
     """
 
     def __init__(
         self, folders: list[ShardFolder], image_size: tuple[int, int], num_graphs: int
     ) -> None:
         self.image_size = image_size
-        everything = [(folder, index) for folder in folders for index in range(len(folder))]
-        count = min(num_graphs, len(everything))
-        self.graphs = [everything[i * len(everything) // count] for i in range(count)]
+        self.graphs = [
+            (folder, index)
+            for folder in folders
+            for index in spread_evenly(len(folder), num_graphs)
+        ]
 
     def __len__(self) -> int:
         return len(self.graphs)
@@ -90,3 +96,30 @@ class ValidationGraphs(Dataset[Views]):
         if sample is None:
             raise DataError(f"no validation graph can be read; last: {skipped[-1]}")
         return lay_out([sample]).unpack()
+
+
+class ValidationShare(IterableDataset[Views]):
+    """The graphs ``rank``, ``rank + world_size``, ... of a validation, one after the other.
+
+    It has no length on purpose: of a process whose share is empty lightning would leave out the
+    end of the validation, where the others wait for it.
+
+    Args:
+        graphs: Of all processes.
+        rank: This process.
+        world_size: Processes.
+    """
+
+    def __init__(self, graphs: ValidationGraphs, rank: int, world_size: int) -> None:
+        self.graphs = graphs
+        self.numbers = range(rank, len(graphs), world_size)
+
+    def __iter__(self) -> Iterator[Views]:
+        """Read one graph after the other."""
+        return (self.graphs[number] for number in self.numbers)
+
+
+def spread_evenly(total: int, count: int) -> Sequence[int]:
+    """Choose ``count`` of the first ``total`` integers, or all if there are fewer."""
+    count = min(count, total)
+    return [number * total // count for number in range(count)]

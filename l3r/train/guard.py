@@ -1,6 +1,7 @@
 """What a step amounts to, over its batches and processes, and whether it counts."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,9 @@ from torch.nn.utils import get_total_norm
 
 from l3r.config import RunConfig
 from l3r.errors import LaunchError
+from l3r.files import append_whole, write_atomic
 from l3r.loss.joint import LossTerms
+from l3r.train.csv_table import bear_loss_of
 from l3r.train.ranks import Agreement, batch_weight
 from l3r.types import Views
 
@@ -66,7 +69,8 @@ class GradientGuard(Callback):
     """Skips a step whose loss or gradient is not finite, on all processes alike.
 
     The keys of the step's graphs, those of all processes, are added to ``bad_steps.jsonl``. Also
-    measures the gradient's norm, as ``train/grad_norm``. Stands behind :class:`StepMean`.
+    measures the gradient's norm, as ``train/grad_norm``. Stands behind :class:`StepMean`. A resumed
+    run goes on counting, and drops the rows after its checkpoint first.
 
     Args:
         path: Where bad steps are written down.
@@ -80,6 +84,11 @@ class GradientGuard(Callback):
         self.agreement = agreement
         self.bad_in_a_row = 0
         self.keys: list[str] = []
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Forget what a stopped run wrote after its checkpoint."""
+        if trainer.is_global_zero:
+            drop_bad_steps_after(self.path, trainer.global_step)
 
     def on_train_batch_start(
         self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Views, batch_idx: int
@@ -104,11 +113,20 @@ class GradientGuard(Callback):
         for parameter in parameters:
             parameter.grad = None
         keys = [key for part in self.agreement.gather(self.keys) for key in part]
-        row = {"step": trainer.global_step, "loss": str(float(loss)), "grad_norm": str(float(norm))}
+        step = trainer.global_step + 1
+        row = {"step": step, "loss": str(float(loss)), "grad_norm": str(float(norm))}
         if trainer.is_global_zero:
-            with self.path.open("a") as stream:
-                stream.write(json.dumps({**row, "keys": keys}) + "\n")
+            with bear_loss_of(f"the row of bad step {step}"):
+                append_whole(self.path, json.dumps({**row, "keys": keys}) + "\n")
         self._count(row)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Give what a checkpoint keeps; it is the same in all processes."""
+        return {"bad_in_a_row": self.bad_in_a_row}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Go on counting."""
+        self.bad_in_a_row = int(state_dict["bad_in_a_row"])
 
     def _count(self, row: dict[str, Any]) -> None:
         self.bad_in_a_row += 1
@@ -119,3 +137,17 @@ class GradientGuard(Callback):
                 f"train.max_bad_steps={self.max_bad_steps} expected; their graphs are listed in "
                 f"{self.path}"
             )
+
+
+def drop_bad_steps_after(path: Path, step: int) -> None:
+    """Forget rows of ``bad_steps.jsonl`` after a step, and half a row that a kill left."""
+    if not path.exists():
+        return
+    kept = []
+    for line in path.read_text(errors="replace").splitlines():
+        try:
+            if json.loads(line)["step"] <= step:
+                kept.append(line + "\n")
+        except (ValueError, TypeError, LookupError):
+            continue
+    write_atomic(path, "".join(kept))

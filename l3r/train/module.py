@@ -12,11 +12,11 @@ from l3r.config import RunConfig, to_plain
 from l3r.graph.diagnostics import summarise_trees
 from l3r.inference.reconstruct import reconstruct_views
 from l3r.loss.joint import JointLoss, LossTerms
-from l3r.metrics.cameras import CameraMetrics, camera_metrics, mean_metrics
+from l3r.metrics.cameras import camera_metrics
 from l3r.model.light3r import Light3R
 from l3r.train.optim import build_optimizer, build_schedule
 from l3r.train.ranks import Agreement, batch_weight
-from l3r.train.run_log import DatasetMeans
+from l3r.train.validation import ValidationScores
 from l3r.types import Prediction, Reconstruction, Views
 
 
@@ -37,9 +37,7 @@ class TrainModule(L.LightningModule):
         self.config = config
         self.model = model
         self.loss = loss
-        self.accuracy: list[tuple[str, CameraMetrics]] = []
-        self.agreement = agreement
-        self.dataset_losses = DatasetMeans(agreement)
+        self.scores = ValidationScores(agreement)
 
     def training_step(self, batch: Views, batch_idx: int) -> dict[str, Any]:
         """Run one optimisation step's forward pass.
@@ -56,29 +54,26 @@ class TrainModule(L.LightningModule):
         return {"loss": weight * terms.total, "graphs": terms.graphs}
 
     def validation_step(self, batch: Views, batch_idx: int) -> dict[str, Reconstruction]:
-        """Log the loss of held-out graphs, and score their cameras by the full inference path.
+        """Score one held-out graph, its cameras by the full inference path.
+
+        Processes may have unequal numbers of graphs, so nothing is sent to others here.
+
+        Args:
+            batch: A batch of one.
+            batch_idx: Unused.
 
         Returns:
-            ``scene``: the last reconstruction, for pictures.
+            ``scene``: the reconstruction, for pictures.
         """
         _, terms = self._compare(batch)
-        self.log_dict(terms.scalars("val"), batch_size=len(batch.key), sync_dist=True)
-        self.dataset_losses.add(batch.dataset, terms.graphs)
-        pairs = reconstruct_views(self.model, batch, self.config.inference)
-        for dataset, (scene, truth) in zip(batch.dataset, pairs, strict=True):
-            self.accuracy.append((dataset, camera_metrics(scene.cam_from_world, truth)))
+        ((scene, truth),) = reconstruct_views(self.model, batch, self.config.inference)
+        cameras = camera_metrics(scene.cam_from_world, truth)
+        self.scores.add(batch.dataset[0], terms, cameras)
         return {"scene": scene}
 
     def on_validation_epoch_end(self) -> None:
-        """Log the mean accuracy over graphs, of all and of each data set."""
-        scored = [pair for part in self.agreement.gather(self.accuracy) for pair in part]
-        mean = mean_metrics([metrics for _, metrics in scored]).to_dict()
-        for dataset in sorted({name for name, _ in scored}):
-            own = mean_metrics([metrics for name, metrics in scored if name == dataset])
-            mean |= {f"{dataset}/{name}": value for name, value in own.to_dict().items()}
-        mean |= self.dataset_losses.take()
-        self.log_dict({f"val/{name}": value for name, value in mean.items()})
-        self.accuracy.clear()
+        """Log the means over the graphs of all processes, of all and of each data set."""
+        self.log_dict({f"val/{name}": value for name, value in self.scores.take().items()})
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """Build AdamW and its schedule."""

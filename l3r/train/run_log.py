@@ -16,7 +16,7 @@ from torch import Tensor
 
 from l3r.export.graph_sheet import write_graph_sheet
 from l3r.files import write_atomic
-from l3r.train.csv_table import append_row, drop_rows_after
+from l3r.train.csv_table import append_row, bear_loss_of, drop_rows_after
 from l3r.train.ranks import Agreement, step_is_whole
 from l3r.train.sinks import Sink
 from l3r.types import Views
@@ -62,12 +62,23 @@ class DatasetMeans:
         return {key: sum_ / count for key, (sum_, count) in sorted(totals.items()) if count}
 
     def state_dict(self) -> dict[str, Any]:
-        """Give what a checkpoint keeps, so that a resumed run's next row is the same."""
-        return dict(self._totals)
+        """Give what a checkpoint keeps, on all processes together: the sums of each, by rank."""
+        own = {key: total.tolist() for key, total in self._totals.items()}
+        return {"parts": self.agreement.gather(own)}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take up the state of a checkpoint."""
-        self._totals = dict(state)
+    def load_state_dict(self, state: Mapping[str, Any], rank: int, world_size: int) -> None:
+        """Take up the state of a checkpoint, which is the same in all processes.
+
+        Args:
+            state: Of as many processes as wrote it.
+            rank: This process, which takes the sums of ``rank``, ``rank + world_size``, ...
+            world_size: Processes now.
+        """
+        self._totals.clear()
+        for part in state["parts"][rank::world_size]:
+            for key, total in part.items():
+                pair = torch.tensor(total)
+                self._totals[key] = self._totals.get(key, torch.zeros_like(pair)) + pair
 
 
 class RunLog(Callback):
@@ -101,6 +112,11 @@ class RunLog(Callback):
         self.sinks = sinks
         self.agreement = agreement
         self.datasets = DatasetMeans(agreement)
+        self.place = 0, 1
+
+    def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        """Find out which of how many processes this is, before a checkpoint is taken up."""
+        self.place = trainer.global_rank, trainer.world_size
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Forget what a stopped run wrote after its checkpoint."""
@@ -146,10 +162,11 @@ class RunLog(Callback):
             return
         step = trainer.global_step
         path = self.folder / "pictures" / f"step_{step:06d}.png"
-        path.parent.mkdir(exist_ok=True)
-        write_graph_sheet(path, outputs["scene"], batch)
-        for sink in self.sinks:
-            sink.add_picture(step, path)
+        with bear_loss_of(f"the picture of step {step}"):
+            path.parent.mkdir(exist_ok=True)
+            write_graph_sheet(path, outputs["scene"], batch)
+            for sink in self.sinks:
+                sink.add_picture(step, path)
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Write a validation row."""
@@ -168,21 +185,27 @@ class RunLog(Callback):
         self.on_train_end(trainer, pl_module)
 
     def state_dict(self) -> dict[str, Any]:
-        """Give what a checkpoint keeps: sums since the last row."""
-        return self.datasets.state_dict()
+        """Give what a checkpoint keeps: sums since the last row, and what sinks go on with."""
+        sinks = {type(sink).__name__: sink.state_dict() for sink in self.sinks}
+        return {"datasets": self.datasets.state_dict(), "sinks": sinks}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take up the sums of a checkpoint."""
-        self.datasets.load_state_dict(state_dict)
+        """Take up the state of a checkpoint."""
+        # Checkpoints of older versions have neither.
+        self.datasets.load_state_dict(state_dict.get("datasets", {"parts": []}), *self.place)
+        for sink in self.sinks:
+            sink.load_state_dict(state_dict.get("sinks", {}).get(type(sink).__name__, {}))
 
     def _write(self, trainer: L.Trainer, kind: str, row: Mapping[str, float]) -> None:
         if not trainer.is_global_zero:
             return
         step = trainer.global_step
         path = self.training if kind == "train" else self.validation
-        append_row(path, {"step": float(step), **row})
+        with bear_loss_of(f"the row of step {step} in {path.name}"):
+            append_row(path, {"step": float(step), **row})
         for sink in self.sinks:
-            sink.write(step, {f"{kind}/{name}": value for name, value in row.items()})
+            with bear_loss_of(f"the row of step {step} in {type(sink).__name__}"):
+                sink.write(step, {f"{kind}/{name}": value for name, value in row.items()})
 
 
 def row_is_due(trainer: L.Trainer, step: int, every: int) -> bool:

@@ -32,6 +32,13 @@ class Sink(ABC):
     def close(self) -> None:
         """Flush; nothing to do where it was never started."""
 
+    def state_dict(self) -> dict[str, str]:
+        """Give what a checkpoint keeps."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, str]) -> None:  # noqa: B027
+        """Take up what a checkpoint kept, before the start."""
+
 
 class TensorBoardSink(Sink):
     """Event files in a folder; those of steps that a resumed run repeats are hidden.
@@ -80,6 +87,9 @@ class WandbSink(Sink):
     The curves' axis is the optimisation step. Rows between the last checkpoint and a kill are sent
     again by the resumed run, under the same steps.
 
+    The run's name is kept in the folder, where it may be changed to send elsewhere, and in
+    checkpoints, for a folder that lost it.
+
     Args:
         config: Mode and project; the whole configuration is shown beside the curves.
         folder: The run's folder, which keeps the run's name in ``wandb_id.txt``.
@@ -88,6 +98,7 @@ class WandbSink(Sink):
     def __init__(self, config: RunConfig, folder: Path) -> None:
         self.config = config
         self.folder = folder
+        self.name = ""
         self.run: Any = None
 
     def start(self, step: int) -> None:
@@ -96,10 +107,11 @@ class WandbSink(Sink):
 
         place = self.folder / "wandb_id.txt"
         if not place.exists():
-            write_atomic(place, secrets.token_hex(4) + "\n")
+            write_atomic(place, (self.name or secrets.token_hex(4)) + "\n")
+        self.name = place.read_text().strip()
         self.run = wandb.init(
             project=self.config.logs.wandb_project,
-            id=place.read_text().strip(),
+            id=self.name,
             name=self.folder.name,
             dir=self.folder,
             config=to_plain(self.config),
@@ -124,6 +136,14 @@ class WandbSink(Sink):
         """Finish the run."""
         if self.run is not None:
             self.run.finish()
+
+    def state_dict(self) -> dict[str, str]:
+        """Give the run's name."""
+        return {"name": self.name}
+
+    def load_state_dict(self, state: Mapping[str, str]) -> None:
+        """Take up the run's name."""
+        self.name = state.get("name", "")
 
 
 def build_sinks(config: RunConfig, folder: Path) -> list[Sink]:

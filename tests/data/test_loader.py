@@ -81,6 +81,7 @@ def test_every_graph_comes_once_before_any_comes_again(shards):
     drawn = list(itertools.chain.from_iterable(keys(loader(config(shards), num_steps=5))))
     assert len(set(drawn[:10])) == 10
     assert len(set(drawn[10:20])) == 10
+    assert drawn[10:20] != drawn[:10], "each time in another order"
 
 
 @given(st.integers(0, 2**31), st.lists(st.integers(1, 30), min_size=1, max_size=3))

@@ -2,6 +2,7 @@
 
 import csv
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -87,6 +88,21 @@ def test_a_job_that_is_signalled_requeues_itself_and_ends_as_if_it_had_not_stopp
     assert f"job {job} is requeued" in said
     assert said.count("2 processes on n[1-2]") == 2
     assert (tmp_path / "out" / "previous.ckpt").exists(), "the one that the signal asked for"
+    assert_same_run(tmp_path / "out", straight)
+
+
+def test_a_job_that_is_told_to_end_saves_and_the_same_command_goes_on(
+    cluster, shards, straight, tmp_path
+):
+    job = submit(cluster, shards, tmp_path)
+    wait_for_step(cluster, job, 60)
+    cluster.signal(job, "TERM")
+    cluster.wait(job, "FAILED", timeout=90)
+    assert re.search(r"SIGTERM: step \d+ is saved .*the same command", cluster.output(job))
+    saved = read_checkpoint(tmp_path / "out" / "last.ckpt")["global_step"]
+    assert 60 <= saved < STEPS
+    job = submit(cluster, shards, tmp_path)
+    cluster.wait(job, timeout=120)
     assert_same_run(tmp_path / "out", straight)
 
 

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from l3r.train.csv_table import append_row, drop_rows_after
 from l3r.train.ranks import Agreement
 from l3r.train.run_log import DatasetMeans
+from tests.train.threads import run_together
 
 GRAPHS = st.lists(st.tuples(st.sampled_from(["a", "b/c", "d"]), st.integers(-9, 9)), min_size=1)
 
@@ -21,7 +22,7 @@ def test_means_of_data_sets_do_not_depend_on_how_graphs_came_in_batches(graphs, 
         means.add([name for name, _ in part], {"loss": values, "error": 2 * values})
         # A checkpoint between any two batches changes nothing.
         copy = DatasetMeans(Agreement())
-        copy.load_state_dict(means.state_dict())
+        copy.load_state_dict(means.state_dict(), 0, 1)
         means = copy
     found = means.take()
     for name in {name for name, _ in graphs}:
@@ -30,6 +31,34 @@ def test_means_of_data_sets_do_not_depend_on_how_graphs_came_in_batches(graphs, 
         assert found[f"{name}/error"] == pytest.approx(2 * sum(own) / len(own), abs=1e-5)
     assert len(found) == 2 * len({name for name, _ in graphs})
     assert means.take() == {}
+
+
+@given(GRAPHS, GRAPHS, st.integers(1, 4), st.integers(1, 4))
+def test_sums_of_all_processes_go_on_in_another_number_of_them(first, second, before, after):
+    """Lightning gives every process the state that the first one wrote."""
+
+    def add(means, graphs):
+        for name, value in graphs:
+            means.add([name], {"loss": torch.tensor([float(value)])})
+
+    def stop(rank, agreement):
+        means = DatasetMeans(agreement)
+        add(means, first[rank::before])
+        return means.state_dict()
+
+    def go_on(rank, agreement):
+        means = DatasetMeans(agreement)
+        means.load_state_dict(state, rank, after)
+        add(means, second[rank::after])
+        return means.take()
+
+    state, *others = run_together(stop, before)
+    assert all(other == state for other in others)
+    straight = DatasetMeans(Agreement())
+    add(straight, first + second)
+    expected = straight.take()
+    for found in run_together(go_on, after):
+        assert found == pytest.approx(expected, abs=1e-5)
 
 
 def test_graphs_of_skipped_steps_do_not_count():

@@ -41,6 +41,19 @@ def test_a_resumed_run_goes_on_with_its_run_of_weights_and_biases(hand_shards, t
     assert all((run / f"run-{name}.wandb").stat().st_size > 0 for run in runs)
 
 
+def test_a_run_whose_name_was_lost_goes_on_with_it(hand_shards, tmp_path):
+    """A folder that was copied without ``wandb_id.txt``: the checkpoint knows the name as well."""
+    place, names = tmp_path / "wandb_id.txt", []
+    for steps in (1, 2):
+        settings = layers(hand_shards, tmp_path, max_steps=steps)
+        train(load_config([*settings, "logs.to=[wandb]", "logs.wandb_mode=offline"]))
+        names.append(place.read_text())
+        place.unlink()
+    assert names[0] == names[1]
+    runs = [*(tmp_path / "wandb").glob("offline-run-*")]
+    assert all(run.name.endswith(f"-{names[0].strip()}") for run in runs)
+
+
 def test_a_missing_package_is_a_clear_error_before_anything_is_written(
     hand_shards, tmp_path, monkeypatch
 ):
