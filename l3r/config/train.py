@@ -36,6 +36,9 @@ class TrainConfig:
     """What the cosine ends at, as a share of ``lr``."""
     clip_norm: float | None = None
     """Clip the gradient's norm; off by default."""
+    ema_decay: float | None = None
+    """Validate and deliver the exponential moving average of the weights, of which a step leaves
+    this share (0.9999, say); null: the weights themselves."""
     max_bad_steps: int = 3
     """Stop after so many steps in a row with a loss or gradient that is not finite."""
     checkpoint_every: int = 1000
@@ -88,5 +91,8 @@ class TrainConfig:
         betas = self.betas
         in_range = len(betas) == 2 and all(0 <= beta < 1 for beta in betas)
         require(in_range, "train.betas", betas, "two numbers from 0 to less than 1")
+        decay = self.ema_decay
+        in_range = decay is None or 0 <= decay < 1
+        require(in_range, "train.ema_decay", decay, "null or 0 to less than 1")
         clip = self.clip_norm
         require(clip is None or clip > 0, "train.clip_norm", clip, "null or more than 0")
