@@ -64,6 +64,9 @@ class TrainConfig:
     """The run ends when a process has waited for another for so long."""
     precision: Precision = "fp32"
     """Of encoder, alignment and decoder; weights, heads, Procrustes and loss stay in float32."""
+    tf32: bool = True
+    """Let NVIDIA GPUs round the factors of the network's float32 products to 10 bits of mantissa;
+    Procrustes, loss and validation never do."""
     compile: bool = False
     """Compile transformer blocks and DPT heads; the first steps take minutes, later ones less."""
     gradient_checkpointing: bool = False

@@ -55,6 +55,8 @@ class Ranks:
         """Build the strategy: gradients are averaged over processes; see :func:`batch_weight`."""
         if self.world_size == 1:
             return "auto"
+        # No static_graph: it breaks off with accumulated gradients, and neither unused parameters
+        # nor non-reentrant checkpoints need it.
         return DDPStrategy(
             timeout=timedelta(minutes=config.timeout_minutes),
             find_unused_parameters=False,

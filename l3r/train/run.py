@@ -33,6 +33,7 @@ from l3r.train.ranks import Agreement, Ranks, explain_failure, find_ranks
 from l3r.train.run_log import RunLog
 from l3r.train.signals import StopSignals
 from l3r.train.sinks import Sink, build_sinks
+from l3r.train.tf32 import NetworkTf32
 
 
 def train(config: RunConfig) -> Path:
@@ -117,6 +118,7 @@ def _build_callbacks(
         RoomGradients(train.log_every),
         StepMean(config),
         guard,
+        NetworkTf32(enabled=train.tf32),
         StepTimer(),
         # On all processes, which give it their figures; the first one writes.
         RunLog(folder, train.log_every, agreement, sinks, pictures=config.logs.pictures),
