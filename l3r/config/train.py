@@ -57,6 +57,9 @@ class TrainConfig:
     """Processes on each node, one for each device; null: as many as srun started, else one."""
     num_nodes: int | None = None
     """Nodes; null: as many as srun started processes on, else one."""
+    strategy: Literal["ddp", "fsdp"] = "ddp"
+    """Of several processes: each holds the whole network, or a share of its weights, gradients and
+    optimiser, which it gathers block by block."""
     accumulate: int = 1
     """Batches in which a device takes its graphs of a step, one after the other: memory for time.
     ``data.graphs_per_step`` is that of all devices and batches."""
@@ -90,6 +93,8 @@ class TrainConfig:
             require(value is None or value > 0, f"train.{key}", value, "more than 0")
         for key in ("warmup_steps", "weight_decay", "validation_graphs", "min_lr_ratio"):
             require(getattr(self, key) >= 0, f"train.{key}", getattr(self, key), "0 or more")
+        both = self.strategy == "fsdp" and self.compile
+        require(not both, "train.compile", self.compile, "false under train.strategy=fsdp")
         require(self.lr > 0, "train.lr", self.lr, "more than 0")
         betas = self.betas
         in_range = len(betas) == 2 and all(0 <= beta < 1 for beta in betas)

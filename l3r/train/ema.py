@@ -12,6 +12,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from l3r.model.weight_files import AVERAGE_KEY
 from l3r.train.guard import GradientGuard
 from l3r.train.ranks import step_is_whole
+from l3r.train.sharding import gather, own_share, shard_like
 from l3r.types import Views
 
 
@@ -20,7 +21,8 @@ class WeightAverage(Callback):
 
     It starts as the weights of the first step, and each step that counts moves it by
     ``1 - decay`` of the way to the new weights, without a wait for the device. Validation sees it
-    in place of the weights. Checkpoints hold both. Stands before what saves after a validation.
+    in place of the weights. Checkpoints hold both. Each process averages what it holds. Stands
+    before what gathers weights for a validation or saves after it.
 
     Args:
         decay: Share of the average that a step leaves, 0 to less than 1.
@@ -30,6 +32,7 @@ class WeightAverage(Callback):
     def __init__(self, decay: float, guard: GradientGuard) -> None:
         self.guard = guard
         self.average: dict[str, Tensor] = {}
+        self.weights: dict[str, Tensor] = {}
         self._move = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
 
     def on_load_checkpoint(
@@ -42,13 +45,17 @@ class WeightAverage(Callback):
         self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
     ) -> None:
         """Put the average beside the weights, under the same names."""
-        checkpoint[AVERAGE_KEY] = dict(self.average)
+        keep = trainer.is_global_zero
+        average = {name: gather(value, keep=keep) for name, value in self.average.items()}
+        checkpoint[AVERAGE_KEY] = average
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Start from the weights, or from the checkpoint's average, where the weights lie."""
-        for name, parameter in pl_module.named_parameters():
-            start = self.average.get(name, parameter).detach()
-            self.average[name] = torch.empty_like(parameter.detach()).copy_(start)
+        self.weights = dict(pl_module.named_parameters())
+        for name, weight in self.weights.items():
+            restored = self.average.get(name)
+            start = weight.detach().clone() if restored is None else shard_like(restored, weight)
+            self.average[name] = start
 
     def on_train_batch_end(
         self,
@@ -60,16 +67,21 @@ class WeightAverage(Callback):
     ) -> None:
         """Follow the weights after a step that counts."""
         if step_is_whole(trainer, batch_idx) and not self.guard.bad_in_a_row:
-            weights = [parameter.detach() for parameter in pl_module.parameters()]
-            self._move(list(self.average.values()), weights, 0)
+            average, weights = self._shares()
+            self._move(average, weights, 0)
 
     def on_validation_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Let validation see the average."""
-        exchange(self.average.values(), pl_module.parameters())
+        exchange(*self._shares())
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Give the weights back, to the last bit."""
-        exchange(self.average.values(), pl_module.parameters())
+        exchange(*self._shares())
+
+    def _shares(self) -> tuple[list[Tensor], list[Tensor]]:
+        """What of average and weights lies here."""
+        average = [own_share(self.average[name]) for name in self.weights]
+        return average, [own_share(weight) for weight in self.weights.values()]
 
 
 @torch.no_grad()

@@ -8,12 +8,12 @@ import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor, nn
-from torch.nn.utils import get_total_norm
 
 from l3r.config import RunConfig
 from l3r.errors import LaunchError
 from l3r.loss.joint import LossTerms
 from l3r.train.ranks import Agreement, batch_weight
+from l3r.train.sharding import total_norm
 from l3r.types import Views
 
 
@@ -90,7 +90,7 @@ class GradientGuard(Callback):
     ) -> None:
         """Drop the gradients of a bad step: the optimiser leaves parameters without one alone."""
         parameters = [p for p in pl_module.parameters() if p.grad is not None]
-        norm = get_total_norm([p.grad for p in parameters if p.grad is not None])
+        norm = total_norm(p.grad for p in parameters if p.grad is not None)
         pl_module.log("train/grad_norm", norm)
         loss = trainer.callback_metrics.get("train/loss", norm)
         is_bad = not bool(torch.isfinite(norm) & torch.isfinite(loss))

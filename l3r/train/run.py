@@ -31,6 +31,7 @@ from l3r.train.guard import GradientGuard, StepMean
 from l3r.train.module import TrainModule
 from l3r.train.ranks import Agreement, Ranks, explain_failure, find_ranks
 from l3r.train.run_log import RunLog
+from l3r.train.sharding import WholeNetwork
 from l3r.train.signals import StopSignals
 from l3r.train.sinks import Sink, build_sinks
 from l3r.train.tf32 import NetworkTf32
@@ -126,6 +127,8 @@ def _build_callbacks(
     ]
     if train.ema_decay is not None:
         callbacks.append(WeightAverage(train.ema_decay, guard))
+    if train.strategy == "fsdp":
+        callbacks.append(WholeNetwork())
     return [*callbacks, StepCheckpoint(folder / "last.ckpt", config, signals, agreement)]
 
 
