@@ -36,6 +36,9 @@ class TrainConfig:
     """What the cosine ends at, as a share of ``lr``."""
     clip_norm: float | None = None
     """Clip the gradient's norm; off by default."""
+    ema_decay: float | None = None
+    """Validate and deliver the exponential moving average of the weights, of which a step leaves
+    this share (0.9999, say); null: the weights themselves."""
     max_bad_steps: int = 3
     """Stop after so many steps in a row with a loss or gradient that is not finite."""
     checkpoint_every: int = 1000
@@ -54,6 +57,9 @@ class TrainConfig:
     """Processes on each node, one for each device; null: as many as srun started, else one."""
     num_nodes: int | None = None
     """Nodes; null: as many as srun started processes on, else one."""
+    strategy: Literal["ddp", "fsdp"] = "ddp"
+    """Of several processes: each holds the whole network, or a share of its weights, gradients and
+    optimiser, which it gathers block by block."""
     accumulate: int = 1
     """Batches in which a device takes its graphs of a step, one after the other: memory for time.
     ``data.graphs_per_step`` is that of all devices and batches."""
@@ -61,6 +67,9 @@ class TrainConfig:
     """The run ends when a process has waited for another for so long."""
     precision: Precision = "fp32"
     """Of encoder, alignment and decoder; weights, heads, Procrustes and loss stay in float32."""
+    tf32: bool = True
+    """Let NVIDIA GPUs round the factors of the network's float32 products to 10 bits of mantissa;
+    Procrustes, loss and validation never do."""
     compile: bool = False
     """Compile transformer blocks and DPT heads; the first steps take minutes, later ones less."""
     gradient_checkpointing: bool = False
@@ -84,9 +93,14 @@ class TrainConfig:
             require(value is None or value > 0, f"train.{key}", value, "more than 0")
         for key in ("warmup_steps", "weight_decay", "validation_graphs", "min_lr_ratio"):
             require(getattr(self, key) >= 0, f"train.{key}", getattr(self, key), "0 or more")
+        both = self.strategy == "fsdp" and self.compile
+        require(not both, "train.compile", self.compile, "false under train.strategy=fsdp")
         require(self.lr > 0, "train.lr", self.lr, "more than 0")
         betas = self.betas
         in_range = len(betas) == 2 and all(0 <= beta < 1 for beta in betas)
         require(in_range, "train.betas", betas, "two numbers from 0 to less than 1")
+        decay = self.ema_decay
+        in_range = decay is None or 0 <= decay < 1
+        require(in_range, "train.ema_decay", decay, "null or 0 to less than 1")
         clip = self.clip_norm
         require(clip is None or clip > 0, "train.clip_norm", clip, "null or more than 0")

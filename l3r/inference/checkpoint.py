@@ -1,10 +1,11 @@
 """Checkpoints: weights and the configuration that made them, nothing else needed."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from l3r.config import RunConfig, from_plain, load_config, override_config, to_plain
 from l3r.model.light3r import Light3R
@@ -82,6 +83,11 @@ def read_checkpoint(path: Path, *, mapped: bool = False) -> dict[str, Any]:
 
 def write_model(path: Path, model: Light3R, config: RunConfig) -> None:
     """Write weights and configuration alone, without the optimiser."""
-    weights = {MODEL_PREFIX + key: value.cpu() for key, value in model.state_dict().items()}
-    content = {"state_dict": weights, "l3r_config": to_plain(config), "l3r_version": __version__}
+    write_weights(path, model.state_dict(), config)
+
+
+def write_weights(path: Path, weights: Mapping[str, Tensor], config: RunConfig) -> None:
+    """Write the weights of a network, under its own names, and their configuration."""
+    named = {MODEL_PREFIX + key: value.cpu() for key, value in weights.items()}
+    content = {"state_dict": named, "l3r_config": to_plain(config), "l3r_version": __version__}
     write_checkpoint(path, content)

@@ -19,6 +19,7 @@ from l3r.model.dpt import DptHead
 from l3r.model.encoder import Encoder
 from l3r.model.grid import TokenGrid, find_transposed
 from l3r.model.heads import build_head, pointmap_from_raw, run_head
+from l3r.model.precision import true_float32
 from l3r.model.pretrained import Pretrained
 from l3r.types import PairPointmaps, Prediction, SceneTree
 
@@ -93,7 +94,7 @@ class Light3R(Pretrained):
         tokens = tokens.reshape(num_graphs, num_views, *tokens.shape[1:])
         scores, tree = self.connect(tokens.mean(dim=2), scores)
         pairs = self._decode_edges(self.alignment(tokens), tree, grid)
-        with torch.autocast(image.device.type, enabled=False):
+        with true_float32(image.device):
             world = accumulate(pairs, tree, self.graph)
         return Prediction(tree=tree, scores=scores, pairs=pairs, world=world)
 
@@ -116,7 +117,7 @@ class Light3R(Pretrained):
         Raises:
             ConfigError: The oracle tree is asked for without scores.
         """
-        with torch.no_grad(), torch.autocast(mean_tokens.device.type, enabled=False):
+        with torch.no_grad(), true_float32(mean_tokens.device):
             if self.graph.algorithm == "oracle":
                 if scores is None:
                     raise ConfigError(

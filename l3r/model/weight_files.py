@@ -22,6 +22,8 @@ from l3r.model.weights import printable
 
 MODEL_PREFIX = "model."
 """Where the network's weights stand in a Light3R checkpoint."""
+AVERAGE_KEY = "average"
+"""Where the moving average of the weights stands, if the training kept one."""
 CONFIG_NAME, WEIGHTS_NAME = "config.json", "model.safetensors"
 """What a folder of the Hugging Face form holds."""
 
@@ -103,8 +105,12 @@ def require_own(content: Mapping[str, Any], where: str) -> None:
 
 
 def network_weights(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Take the network's state dict out of what :func:`require_own` let through."""
-    state = content["state_dict"]
+    """Take the network's state dict out of what :func:`require_own` let through.
+
+    Where the training kept a moving average of the weights, that is the network.
+    """
+    average = content.get(AVERAGE_KEY)
+    state = content["state_dict"] | (average if isinstance(average, dict) else {})
     return {
         key.removeprefix(MODEL_PREFIX): value
         for key, value in state.items()

@@ -17,11 +17,11 @@ from rich.progress import (
     TextColumn,
     TimeRemainingColumn,
 )
-from torch.nn.utils import get_total_norm
 
 from l3r.data.loader import StepLoader
 from l3r.train.ranks import step_is_whole
 from l3r.train.run_log import row_is_due
+from l3r.train.sharding import total_norm
 from l3r.types import Views
 
 
@@ -148,7 +148,7 @@ class RoomGradients(Callback):
                 room = name.removeprefix("model.").split(".")[0]
                 norms["heads" if room.endswith("_head") else room].append(parameter.grad)
         for room, gradients in norms.items():
-            pl_module.log(f"train/grad_norm_{room}", get_total_norm(gradients))
+            pl_module.log(f"train/grad_norm_{room}", total_norm(gradients))
 
 
 class StepProgress(Callback):

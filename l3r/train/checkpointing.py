@@ -40,6 +40,7 @@ FREE_TO_CHANGE = {
     "train.note",
     "train.num_nodes",
     "train.output_dir",
+    "train.strategy",
     "train.timeout_minutes",
     "train.validate_every",
     "train.validation_graphs",

@@ -10,7 +10,6 @@ import torch
 import torch.distributed as dist
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor, nn
-from torch.nn.utils import get_total_norm
 
 from l3r.config import RunConfig
 from l3r.errors import LaunchError
@@ -18,6 +17,7 @@ from l3r.files import append_whole, write_atomic
 from l3r.loss.joint import LossTerms
 from l3r.train.csv_table import bear_loss_of
 from l3r.train.ranks import Agreement, batch_weight
+from l3r.train.sharding import total_norm
 from l3r.types import Views
 
 
@@ -103,7 +103,7 @@ class GradientGuard(Callback):
     ) -> None:
         """Drop the gradients of a bad step: the optimiser leaves parameters without one alone."""
         parameters = [p for p in pl_module.parameters() if p.grad is not None]
-        norm = get_total_norm([p.grad for p in parameters if p.grad is not None])
+        norm = total_norm(p.grad for p in parameters if p.grad is not None)
         pl_module.log("train/grad_norm", norm)
         loss = trainer.callback_metrics.get("train/loss", norm)
         is_bad = not bool(torch.isfinite(norm) & torch.isfinite(loss))

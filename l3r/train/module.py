@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor
+from torch.nn.utils import clip_grad_norm_
 
 from l3r.config import RunConfig, to_plain
 from l3r.graph.diagnostics import summarise_trees
@@ -83,6 +84,16 @@ class TrainModule(L.LightningModule):
             "optimizer": optimizer,
             "lr_scheduler": {"scheduler": schedule, "interval": "step"},
         }
+
+    def configure_gradient_clipping(
+        self,
+        optimizer: torch.optim.Optimizer,
+        gradient_clip_val: float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """Clip by the norm of all; lightning's own does not let a fused optimiser near autocast."""
+        if gradient_clip_val is not None:
+            clip_grad_norm_(self.parameters(), gradient_clip_val)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Store the whole configuration beside the weights, as builtins."""

@@ -17,6 +17,7 @@ from lightning.pytorch.strategies import DDPStrategy, Strategy
 
 from l3r.config import RunConfig, TrainConfig
 from l3r.errors import ConfigError, L3RError, LaunchError
+from l3r.train.sharding import ShardedStrategy
 from l3r.types import Views
 
 _PEER_FAILURE = re.compile(
@@ -55,8 +56,13 @@ class Ranks:
         """Build the strategy: gradients are averaged over processes; see :func:`batch_weight`."""
         if self.world_size == 1:
             return "auto"
+        timeout = timedelta(minutes=config.timeout_minutes)
+        if config.strategy == "fsdp":
+            return ShardedStrategy(timeout=timeout)
+        # No static_graph: it breaks off with accumulated gradients, and neither unused parameters
+        # nor non-reentrant checkpoints need it.
         return DDPStrategy(
-            timeout=timedelta(minutes=config.timeout_minutes),
+            timeout=timeout,
             find_unused_parameters=False,
             gradient_as_bucket_view=True,
             broadcast_buffers=False,

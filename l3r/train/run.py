@@ -13,10 +13,11 @@ from lightning.pytorch.callbacks import Callback
 from l3r.config import RunConfig, to_yaml
 from l3r.errors import CheckpointError, ConfigError
 from l3r.files import write_atomic
-from l3r.inference.checkpoint import write_model
+from l3r.inference.checkpoint import read_checkpoint, write_weights
 from l3r.inference.weights import initialise
 from l3r.loss.joint import JointLoss
 from l3r.model.light3r import Light3R
+from l3r.model.weight_files import network_weights
 from l3r.train.callbacks import RoomGradients, StepProgress, StepTimer
 from l3r.train.checkpointing import (
     CheckpointFiles,
@@ -25,12 +26,15 @@ from l3r.train.checkpointing import (
     find_resume,
 )
 from l3r.train.datamodule import ShardData
+from l3r.train.ema import WeightAverage
 from l3r.train.guard import GradientGuard, StepMean
 from l3r.train.module import TrainModule
 from l3r.train.ranks import Agreement, Ranks, explain_failure, find_ranks
 from l3r.train.run_log import RunLog
+from l3r.train.sharding import WholeNetwork
 from l3r.train.signals import StopSignals
 from l3r.train.sinks import Sink, build_sinks
+from l3r.train.tf32 import NetworkTf32
 
 
 def train(config: RunConfig) -> Path:
@@ -87,7 +91,8 @@ def train(config: RunConfig) -> Path:
     if files.problem:
         raise CheckpointError(f"{last}: the end cannot be saved ({files.problem}); make room")
     if ranks.is_first:
-        write_model(folder / "model.ckpt", model, config)
+        weights = network_weights(read_checkpoint(last, mapped=True))
+        write_weights(folder / "model.ckpt", weights, config)
     return folder / "model.ckpt"
 
 
@@ -110,15 +115,21 @@ def _build_callbacks(
     train = config.train
     folder = Path(train.output_dir)
     timer = StepTimer(train.log_every, config.data.graphs_per_step)
+    guard = GradientGuard(folder / "bad_steps.jsonl", train.max_bad_steps, agreement)
     callbacks: list[Callback] = [
         RoomGradients(train.log_every),
         StepMean(config),
-        GradientGuard(folder / "bad_steps.jsonl", train.max_bad_steps, agreement),
+        guard,
+        NetworkTf32(enabled=train.tf32),
         timer,
         # On all processes, which give it their figures; the first one writes.
         RunLog(folder, train.log_every, agreement, sinks, pictures=config.logs.pictures),
         StepProgress(timer),
     ]
+    if train.ema_decay is not None:
+        callbacks.append(WeightAverage(train.ema_decay, guard))
+    if train.strategy == "fsdp":
+        callbacks.append(WholeNetwork())
     return [*callbacks, StepCheckpoint(folder / "last.ckpt", config, signals, agreement)]
 
 

@@ -12,7 +12,7 @@ import torch
 from l3r.config import InferenceConfig, load_config
 from l3r.data.source import ShardFolder
 from l3r.data.steps import read_graph
-from l3r.inference.checkpoint import load_model
+from l3r.inference.checkpoint import load_model, read_checkpoint
 from l3r.inference.reconstruct import reconstruct_views
 from l3r.train.run import train
 from tests.data.graphs import make_mixed_graph, write_folder
@@ -105,3 +105,14 @@ def test_compiled_blocks_train_to_the_same_losses(plain, hand_shards, tmp_path):
     assert done.returncode == 0, done.stderr
     for step, (loss, _) in losses(tmp_path).items():
         assert float(loss) == pytest.approx(float(losses(plain)[step][0]), rel=1e-3)
+
+
+def test_the_gradient_is_clipped_in_bfloat16_too(hand_shards, tmp_path):
+    changes = layers(hand_shards, tmp_path, max_steps=1, precision="bf16", clip_norm=1e-3)
+    train(load_config(changes))
+    assert float(read_log(tmp_path)[0]["grad_norm"]) > 1e-2
+    content = read_checkpoint(tmp_path / "last.ckpt")
+    moments = content["optimizer_states"][0]["state"].values()
+    norm = torch.stack([state["exp_avg"].norm() for state in moments]).norm()
+    first_share = 1 - content["l3r_config"]["train"]["betas"][0]
+    assert float(norm) == pytest.approx(first_share * 1e-3, rel=1e-3)
