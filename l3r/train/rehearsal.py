@@ -225,7 +225,7 @@ class Rehearsal:
 
     def _verdict(self) -> str:
         is_bound = len(self.seconds_of) < len(self.image_sizes)
-        took = f"{'at most ' if is_bound else ''}{self.hours:,.3g} h"
+        took = f"{'at most ' if is_bound else ''}{format_seconds(3600 * self.hours)}"
         if self.device == "CPU":
             took += " at the rate of this CPU"
         else:
@@ -239,7 +239,7 @@ def tell(words: str) -> None:
     sys.stderr.flush()
 
 
-def format_bytes(size: float) -> str:
+def format_bytes(size: int) -> str:
     """Three digits and a unit: GiB, or MiB below one."""
     return f"{size / 2**30:,.1f} GiB" if size >= 2**30 else f"{size / 2**20:,.1f} MiB"
 

@@ -127,8 +127,8 @@ class StepWatch(Callback):
         return replace(
             memory,
             optimizer=self.optimizer_bytes,
-            # The rest of a checkpoint, configuration and counters, is small.
-            others=others if others > memory.weights // 4 else 0,
+            # Configuration and counters are small.
+            others=others if others > max(memory.weights // 4, 2**20) else 0,
             peak=peak,
             reserved=reserved,
             capacity=capacity,
