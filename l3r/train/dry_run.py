@@ -5,6 +5,7 @@ import os
 import shutil
 import tempfile
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -54,8 +55,8 @@ def rehearse(config: RunConfig) -> Rehearsal:
     first_step = _find_first_step(config, start)
     here = _find_processes(config, start.ranks)
     own = _take_share(config, start.ranks, here)
-    loader = _build_loader(own, here)
-    sizes = sorted(set(loader.dataset.variation.image_sizes), key=math.prod, reverse=True)
+    shapes = config.data.image_sizes or [config.model.image_size]
+    sizes = sorted({(height, width) for height, width in shapes}, key=math.prod, reverse=True)
     rehearsal = Rehearsal(
         config=config,
         ranks=start.ranks,
@@ -64,13 +65,15 @@ def rehearse(config: RunConfig) -> Rehearsal:
         image_sizes=tuple(sizes),
         free_bytes=free_bytes,
     )
+    data = RehearsalData(own, here, rehearsal.image_sizes, first_step)
     if here.is_first:
-        rehearsal = _try_data(rehearsal, own, loader)
+        # Others wait for it when they first connect: what is wrong with the data is told once.
+        rehearsal = _try_data(rehearsal, own, data.loader)
     parts = here.world_size * config.train.accumulate
     num_graphs = -(-own.data.graphs_per_step // parts)
     memory = count_memory(start.model, config, sizes[0], num_graphs)
     _require_memory(memory.counted, config, here)
-    rehearsal = _try_steps(replace(rehearsal, memory=memory), own, here, start, loader)
+    rehearsal = _try_steps(replace(rehearsal, memory=memory), own, here, start, data)
     needed = KEPT_CHECKPOINTS * rehearsal.checkpoint_bytes
     if needed > free_bytes:
         raise LaunchError(
@@ -98,19 +101,46 @@ class ShapesInTurn(Variation):
 
 
 class RehearsalData(ShardData):
-    """The data of a run, its training batches from a loader that was built before.
+    """The data of a run, its training batches of the largest shape first.
 
     Args:
         config: The whole run.
-        loader: Training batches.
+        ranks: The processes that take the steps.
+        sizes: Shapes in the order in which they are tried.
+        first_step: Steps that the run has taken already.
     """
 
-    def __init__(self, config: RunConfig, loader: StepLoader) -> None:
+    def __init__(
+        self, config: RunConfig, ranks: Ranks, sizes: tuple[Size, ...], first_step: int
+    ) -> None:
         super().__init__(config)
-        self.loader = loader
+        self.ranks = ranks
+        self.sizes = sizes
+        self.first_step = first_step
+
+    @cached_property
+    def loader(self) -> StepLoader:
+        """The training batches of this process, as the run will have them."""
+        height, width = self.config.model.image_size
+        train = self.config.train
+        rank, world_size = self.ranks.rank, self.ranks.world_size
+        return build_training_loader(
+            self.config.data,
+            (height, width),
+            seed=train.seed,
+            num_steps=train.max_steps,
+            share=DeviceShare(rank=rank, world_size=world_size, accumulate=train.accumulate),
+        )
 
     def train_dataloader(self) -> StepLoader:
-        """Give the loader."""
+        """Give these batches with shapes in turn."""
+        drawn = self.loader.dataset.variation
+        self.loader.dataset.variation = ShapesInTurn(
+            image_sizes=self.sizes,
+            color_jitter=drawn.color_jitter,
+            seed=drawn.seed,
+            first_step=self.first_step,
+        )
         return self.loader
 
 
@@ -125,17 +155,10 @@ def _try_data(rehearsal: Rehearsal, config: RunConfig, loader: StepLoader) -> Re
 
 
 def _try_steps(
-    rehearsal: Rehearsal, config: RunConfig, here: Ranks, start: Start, loader: StepLoader
+    rehearsal: Rehearsal, config: RunConfig, here: Ranks, start: Start, data: RehearsalData
 ) -> Rehearsal:
     """Let the real trainer take a few steps."""
     sizes = rehearsal.image_sizes
-    variation = loader.dataset.variation
-    loader.dataset.variation = ShapesInTurn(
-        image_sizes=sizes,
-        color_jitter=variation.color_jitter,
-        seed=variation.seed,
-        first_step=rehearsal.first_step,
-    )
     if here.is_first:
         tell(f"taking steps, the first at {sizes[0][0]}x{sizes[0][1]}")
     agreement = Agreement()
@@ -148,12 +171,7 @@ def _try_steps(
         trainer = build_trainer(config, here, [*callbacks, watch], files)
         module = TrainModule(config, start.model, JointLoss(config.loss), agreement)
         with explain_failures(trainer, here, config.train):
-            trainer.fit(
-                module,
-                datamodule=RehearsalData(config, loader),
-                ckpt_path=start.resume_from,
-                weights_only=True,
-            )
+            trainer.fit(module, datamodule=data, ckpt_path=start.resume_from, weights_only=True)
             trainer.save_checkpoint(Path(folder) / "last.ckpt")
     memory = watch.add_measured(rehearsal.memory, files.num_bytes)
     name = torch.cuda.get_device_name(watch.device) if watch.device.type == "cuda" else "CPU"
@@ -214,15 +232,6 @@ def _take_share(config: RunConfig, ranks: Ranks, here: Ranks) -> RunConfig:
         validation_graphs=min(config.train.validation_graphs, here.world_size),
     )
     return replace(config, data=replace(config.data, graphs_per_step=graphs), train=train)
-
-
-def _build_loader(config: RunConfig, ranks: Ranks) -> StepLoader:
-    height, width = config.model.image_size
-    train = config.train
-    share = DeviceShare(rank=ranks.rank, world_size=ranks.world_size, accumulate=train.accumulate)
-    return build_training_loader(
-        config.data, (height, width), seed=train.seed, num_steps=train.max_steps, share=share
-    )
 
 
 def _require_memory(num_bytes: int, config: RunConfig, here: Ranks) -> None:
