@@ -49,11 +49,12 @@ class MemoryFacts:
     others: int = 0
     """What a checkpoint holds beside weights and optimiser, such as a moving average."""
     peak: int = 0
-    """Of tensors on the GPU, measured, of the process that is nearest to its GPU's capacity."""
+    """Measured: tensors of the process that is nearest to its GPU's capacity; on a CPU all that
+    this process had in use."""
     reserved: int = 0
     """What torch's allocator took for them."""
     capacity: int = 0
-    """Of that GPU; 0 where there is none, and nothing is measured."""
+    """Of that GPU; 0 where there is none."""
 
     @property
     def counted(self) -> int:
@@ -207,18 +208,20 @@ class Rehearsal:
             capacity = format_bytes(memory.capacity)
             yield "", f"{peak} measured at the peak, {reserved} reserved, of {capacity}"
         else:
-            yield "", "an estimate for a GPU, not measured; loss and scratch come on top"
+            peak = format_bytes(memory.peak)
+            yield "", f"{peak} measured, all of this process on the CPU; no GPU was tried"
 
     def _describe_steps(self) -> Iterator[tuple[str, str]]:
         for number, (size, seconds) in enumerate(self.seconds_of.items()):
             same = [step for step in self.steps if step.image_size == size]
             settled = same[1:] or same
             wait = sum(step.waited for step in settled) / sum(step.seconds for step in settled)
+            # The first step waits for the loader processes to start.
+            waited = f", {wait:.0%} of it waiting for data" if len(same) > 1 else ""
             rate = self.config.data.graphs_per_step / seconds
             yield (
                 "" if number else "step",
-                f"{size[0]}x{size[1]}: {format_seconds(seconds)}, {rate:.3g} graphs/s, "
-                f"{wait:.0%} of it waiting for data",
+                f"{size[0]}x{size[1]}: {format_seconds(seconds)}, {rate:.3g} graphs/s{waited}",
             )
         first = self.steps[0]
         yield "", f"loss {first.loss:.4g}, gradient norm {first.grad_norm:.4g} in the first"

@@ -13,6 +13,7 @@ from lightning.pytorch.callbacks import Callback
 
 from l3r.config import RunConfig
 from l3r.errors import LaunchError
+from l3r.inference.clock import resident_peak_mib
 from l3r.model.activations import count_kept
 from l3r.model.light3r import Light3R
 from l3r.train.checkpointing import CheckpointFiles, require_same_step
@@ -50,7 +51,7 @@ class StepWatch(Callback):
         self.step_ended = self.batch_ended = 0.0
         self.optimizer_bytes = 0
         self.device = torch.device("cpu")
-        self.used = (0, 0, 0)  # peak, reserved and capacity, on a GPU
+        self.used = (0, 0, 0)  # peak, and on a GPU reserved and capacity
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         """Connect to the other processes."""
@@ -106,6 +107,7 @@ class StepWatch(Callback):
         states = trainer.optimizers[0].state.values()
         tensors = [x for state in states for x in state.values() if isinstance(x, torch.Tensor)]
         self.optimizer_bytes = sum(tensor.nbytes for tensor in tensors)
+        self.used = (round(2**20 * resident_peak_mib()), 0, 0)
         if self.device.type == "cuda":
             own = (
                 torch.cuda.max_memory_allocated(self.device),

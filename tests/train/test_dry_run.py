@@ -198,6 +198,14 @@ def test_two_processes_take_the_steps_and_one_tells(hand_shards, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.gpu
+def test_memory_is_measured_on_a_gpu(hand_shards, tmp_path):
+    found = rehearse(load_config(layers(hand_shards, tmp_path / "out", accelerator="gpu")))
+    memory = found.memory
+    assert memory.weights < memory.peak <= memory.reserved < memory.capacity
+    assert "GPU-hours" in found.to_table()
+
+
 def rehearsal(seconds, **changes):
     steps = [
         StepFacts(image_size=size, seconds=value, waited=0.0, loss=1.0, grad_norm=1.0)
