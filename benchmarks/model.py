@@ -16,12 +16,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from benchmarks.flops import backward_from, count_flops, count_kept, part_calls
+from benchmarks.flops import backward_from, count_flops
 from benchmarks.timing import seconds
 from l3r.config import InferenceConfig, Precision, RunConfig, load_config
 from l3r.inference.clock import StageClock
 from l3r.inference.reconstruct import reconstruct_photos
 from l3r.loss.joint import JointLoss
+from l3r.model.activations import count_kept, part_calls
 from l3r.model.light3r import Light3R
 from l3r.model.precision import reduced_precision
 from l3r.train.optim import build_optimizer

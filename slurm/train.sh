@@ -5,6 +5,9 @@
 #   sbatch --nodes=2 --ntasks-per-node=8 slurm/train.sh configs/base.yaml configs/model/l3r_224.yaml \
 #       configs/train/paper_224.yaml data.sources.waymo.shards=shards/waymo ...
 #
+# The same with --time=0:20:00 before the script's name and --dry-run at the end tries data, memory
+# and a few steps, and writes nothing but its log.
+#
 # Two minutes before the time limit it saves, requeues itself and goes on later; so does a job that
 # is preempted or loses a node. Submitted again, it goes on where it stopped.
 # Account, partition, modules and Python come from slurm/site.env; see docs/cluster.md.

@@ -39,7 +39,7 @@ class StageClock:
             torch.cuda.synchronize(self.device)
             peak = torch.cuda.max_memory_allocated(self.device) / 2**20
         else:
-            peak = _resident_peak_mib()
+            peak = resident_peak_mib()
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
         self.peak_mib[name] = max(self.peak_mib.get(name, 0.0), peak)
 
@@ -51,7 +51,8 @@ def _reset_resident_peak() -> None:
         return
 
 
-def _resident_peak_mib() -> float:
+def resident_peak_mib() -> float:
+    """Largest memory that this process has had in use since its start or the last reset [MiB]."""
     try:
         for line in _STATUS.read_text().splitlines():
             if line.startswith("VmHWM:"):

@@ -125,12 +125,7 @@ class StepCheckpoint(Checkpoint):
         """Check that all processes have read the same checkpoint."""
         self.signals.install()
         self.saved_at = time.monotonic()
-        steps = self.agreement.gather(trainer.global_step)
-        if len(set(steps)) > 1:
-            raise CheckpointError(
-                f"{self.path}: the processes go on from steps {steps}, by rank; expected the same; "
-                "train.output_dir must be a folder that all nodes share"
-            )
+        require_same_step(trainer.global_step, str(self.path), self.agreement)
 
     def on_train_batch_end(
         self,
@@ -179,6 +174,25 @@ class StepCheckpoint(Checkpoint):
         # None ends before the controller knows: a process that ends may end the job.
         outcome = str(self.agreement.gather(outcome)[0])
         raise LaunchError(f"{said}; {outcome}")
+
+
+def require_same_step(step: int, where: str, agreement: Agreement) -> None:
+    """Check that all processes have read the same checkpoint.
+
+    Args:
+        step: That this process goes on from.
+        where: The checkpoint or its folder, for the message.
+        agreement: With the other processes.
+
+    Raises:
+        CheckpointError: They have not.
+    """
+    steps = agreement.gather(step)
+    if len(set(steps)) > 1:
+        raise CheckpointError(
+            f"{where}: the processes go on from steps {steps}, by rank; expected the same; "
+            "train.output_dir must be a folder that all nodes share"
+        )
 
 
 def previous_of(path: Path) -> Path:

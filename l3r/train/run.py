@@ -4,14 +4,17 @@ import logging
 import signal
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback
 
-from l3r.config import RunConfig, to_yaml
-from l3r.errors import CheckpointError, ConfigError
+from l3r.config import RunConfig, TrainConfig, to_yaml
+from l3r.errors import CheckpointError, ConfigError, LaunchError
 from l3r.files import write_atomic
 from l3r.inference.checkpoint import read_checkpoint, write_weights
 from l3r.inference.weights import initialise
@@ -37,6 +40,20 @@ from l3r.train.sinks import Sink, build_sinks
 from l3r.train.tf32 import NetworkTf32
 
 
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """What a run begins with; nothing is written yet."""
+
+    ranks: Ranks
+    """The processes."""
+    sinks: list[Sink]
+    """Places for the log, on the first process."""
+    resume_from: Path | None
+    """Checkpoint that it goes on from."""
+    model: Light3R
+    """The network, with ``train.init`` in it where the run is new."""
+
+
 def train(config: RunConfig) -> Path:
     """Train, or go on from where the same run stopped.
 
@@ -53,47 +70,81 @@ def train(config: RunConfig) -> Path:
         ConfigError: No data, ``output_dir`` holds another run, or a package of ``logs.to`` is
             missing.
         DataError: The shards cannot be read.
-        LaunchError: Too many bad steps in a row, another process was lost, or a signal came; the
-            same call goes on.
+        LaunchError: Too many bad steps in a row, another process was lost, memory ran out, or a
+            signal came; the same call goes on.
     """
-    if config.train.accelerator == "gpu" and not torch.cuda.is_available():
-        raise ConfigError("train.accelerator is gpu and torch finds none; use auto or cpu")
-    ranks = find_ranks(config)
+    start = prepare_start(config)
+    ranks = start.ranks
     folder = Path(config.train.output_dir)
     last = folder / "last.ckpt"
-    sinks = build_sinks(config, folder) if ranks.is_first else []
-    resume_from = find_resume(last, config)
-    model = _build_model(config, ranks, is_fresh=resume_from is None)
     if ranks.is_first:
         folder.mkdir(parents=True, exist_ok=True)
         clear_leftovers(last)
         write_atomic(folder / "config.yaml", to_yaml(config).encode())
     agreement = Agreement()
-    module = TrainModule(config, model, JointLoss(config.loss), agreement)
-    _quieten_lightning()
+    module = TrainModule(config, start.model, JointLoss(config.loss), agreement)
     files = CheckpointFiles(config.train.accumulate)
     with StopSignals() as signals:
-        callbacks = _build_callbacks(config, signals, sinks, agreement)
-        trainer = _build_trainer(config, ranks, callbacks, files)
-        try:
+        callbacks = build_callbacks(config, signals, start.sinks, agreement)
+        trainer = build_trainer(config, ranks, callbacks, files)
+        with explain_failures(trainer, ranks, config.train):
             trainer.fit(
-                module, datamodule=ShardData(config), ckpt_path=resume_from, weights_only=True
+                module, datamodule=ShardData(config), ckpt_path=start.resume_from, weights_only=True
             )
             trainer.save_checkpoint(last)
-        except RuntimeError as error:
-            explained = explain_failure(error, ranks, config.train)
-            if explained is None:
-                raise
-            if trainer.strategy.launcher is not None:
-                # Those that this process started, and that may hang; srun ends its own.
-                trainer.strategy.launcher.kill(signal.SIGKILL)
-            raise explained from error
     if files.problem:
         raise CheckpointError(f"{last}: the end cannot be saved ({files.problem}); make room")
     if ranks.is_first:
         weights = network_weights(read_checkpoint(last, mapped=True))
         write_weights(folder / "model.ckpt", weights, config)
     return folder / "model.ckpt"
+
+
+def prepare_start(config: RunConfig) -> Start:
+    """Find and build all that can refuse a run before anything is written.
+
+    Raises:
+        CheckpointError: See :func:`train`.
+        ConfigError: See :func:`train`.
+    """
+    if config.train.accelerator == "gpu" and not torch.cuda.is_available():
+        raise ConfigError("train.accelerator is gpu and torch finds none; use auto or cpu")
+    ranks = find_ranks(config)
+    folder = Path(config.train.output_dir)
+    sinks = build_sinks(config, folder) if ranks.is_first else []
+    resume_from = find_resume(folder / "last.ckpt", config)
+    model = _build_model(config, ranks, is_fresh=resume_from is None)
+    return Start(ranks=ranks, sinks=sinks, resume_from=resume_from, model=model)
+
+
+@contextmanager
+def explain_failures(trainer: L.Trainer, ranks: Ranks, config: TrainConfig) -> Iterator[None]:
+    """Make one line of what torch says of lost processes and of memory that ran out.
+
+    Raises:
+        LaunchError: That line.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        explained = explain_failure(error, ranks, config)
+        if isinstance(error, torch.OutOfMemoryError):
+            explained = _explain_memory(error, ranks)
+        if explained is None:
+            raise
+        if trainer.strategy.launcher is not None:
+            # Those that this process started, and that may hang; srun ends its own.
+            trainer.strategy.launcher.kill(signal.SIGKILL)
+        raise explained from error
+
+
+def _explain_memory(error: torch.OutOfMemoryError, ranks: Ranks) -> LaunchError:
+    found = ". ".join(str(error).split("\n")[0].split(". ")[:3])
+    return LaunchError(
+        f"process {ranks.rank} of {ranks.world_size}: {found.rstrip('.')}; raise train.accumulate "
+        "or the number of devices, or set train.gradient_checkpointing=true or "
+        "train.precision=bf16"
+    )
 
 
 def _build_model(config: RunConfig, ranks: Ranks, *, is_fresh: bool) -> Light3R:
@@ -109,9 +160,10 @@ def _build_model(config: RunConfig, ranks: Ranks, *, is_fresh: bool) -> Light3R:
     return model
 
 
-def _build_callbacks(
+def build_callbacks(
     config: RunConfig, signals: StopSignals, sinks: list[Sink], agreement: Agreement
 ) -> list[Callback]:
+    """Build what happens around the steps of a run."""
     train = config.train
     folder = Path(train.output_dir)
     timer = StepTimer(train.log_every, config.data.graphs_per_step)
@@ -133,9 +185,11 @@ def _build_callbacks(
     return [*callbacks, StepCheckpoint(folder / "last.ckpt", config, signals, agreement)]
 
 
-def _build_trainer(
+def build_trainer(
     config: RunConfig, ranks: Ranks, callbacks: list[Callback], files: CheckpointFiles
 ) -> L.Trainer:
+    """Build lightning's trainer of a run."""
+    _quieten_lightning()
     train = config.train
     trainer = L.Trainer(
         accelerator=train.accelerator,

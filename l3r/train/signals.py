@@ -42,6 +42,10 @@ class StopSignals:
     def __contains__(self, number: signal.Signals) -> bool:
         return number in self._seen
 
+    def __bool__(self) -> bool:
+        """Whether any has come."""
+        return bool(self._seen)
+
     def forget(self, number: signal.Signals) -> None:
         """Take a signal as obeyed."""
         self._seen.discard(number)

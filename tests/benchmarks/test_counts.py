@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from benchmarks.bare import record_bare
-from benchmarks.flops import count_flops, count_kept, flops_of
+from benchmarks.flops import count_flops, flops_of
 from l3r.config import GraphConfig, load_config
+from l3r.model.activations import count_kept
 from l3r.model.light3r import Light3R
 from l3r.model.rope import rope_tables
 

@@ -52,8 +52,8 @@ def straight(shards, tmp_path_factory):
     return out
 
 
-def submit(cluster, shards, tmp_path, *, options=TWO, **train):
-    arguments = layers(shards, tmp_path / "out", **train)
+def submit(cluster, shards, tmp_path, *more, options=TWO, **train):
+    arguments = [*layers(shards, tmp_path / "out", **train), *more]
     return cluster.sbatch(SCRIPT, *arguments, cwd=tmp_path, env=LOCAL, **options)
 
 
@@ -74,6 +74,21 @@ def assert_same_run(out, straight):
     found, weights = (read_checkpoint(f / "model.ckpt")["state_dict"] for f in (out, straight))
     for key, value in weights.items():
         torch.testing.assert_close(found[key], value, rtol=1e-2, atol=1e-4)
+
+
+def test_a_dry_run_takes_its_steps_on_all_nodes_and_leaves_nothing_but_its_answer(
+    cluster, shards, tmp_path
+):
+    job = submit(cluster, shards, tmp_path, "--dry-run")
+    cluster.wait(job, timeout=120)
+    said = cluster.output(job)
+    assert said.count(f"ready: {STEPS} steps to take") == 1
+    assert "CPU, 2 processes" in said
+    assert said.count("dry run: step 1 ") == 1
+    assert not (tmp_path / "out").exists()
+    job = submit(cluster, tmp_path / "nowhere", tmp_path, "--dry-run")
+    cluster.wait(job, "FAILED", timeout=120)
+    assert cluster.output(job).count("nowhere/manifest.json: no such file") == 1
 
 
 def test_a_job_that_is_signalled_requeues_itself_and_ends_as_if_it_had_not_stopped(

@@ -50,10 +50,10 @@ def shards(tmp_path):
 
 
 def test_every_process_gets_the_layers_as_given_and_meets_on_the_first_node(run_job):
-    done = run_job("a.yaml", "train.note=two words")
+    done = run_job("a.yaml", "train.note=two words", "--dry-run")
     assert done.stdout.splitlines() == [
         *("n4", "--kill-on-bad-exit=1", "--cpus-per-task=3"),
-        *("l3r", "train", "a.yaml", "train.note=two words"),
+        *("l3r", "train", "a.yaml", "train.note=two words", "--dry-run"),
     ]
 
 
