@@ -5,8 +5,8 @@ train.output_dir: config.yaml, metrics.csv, validation.csv, last.ckpt (to go on)
 and model.ckpt (weights).
 
 --dry-run reads from every source, takes a few steps as the run would, says what
-they took in time and memory, and writes nothing; one line and exit code 2 if the
-run would fail.
+they took in time and memory, and writes nothing; one line and exit code 2 if
+the run would fail.
 
 Examples::
 

@@ -72,7 +72,8 @@ def rehearse(config: RunConfig) -> Rehearsal:
     parts = here.world_size * config.train.accumulate
     num_graphs = -(-own.data.graphs_per_step // parts)
     memory = count_memory(start.model, config, sizes[0], num_graphs)
-    _require_memory(memory.counted, config, here)
+    is_shared = config.train.strategy == "fsdp"
+    _require_memory(memory.shared_out(here.world_size if is_shared else 1).counted, config, here)
     rehearsal = _try_steps(replace(rehearsal, memory=memory), own, here, start, data)
     needed = KEPT_CHECKPOINTS * rehearsal.checkpoint_bytes
     if needed > free_bytes:
@@ -174,6 +175,8 @@ def _try_steps(
             trainer.fit(module, datamodule=data, ckpt_path=start.resume_from, weights_only=True)
             trainer.save_checkpoint(Path(folder) / "last.ckpt")
     memory = watch.add_measured(rehearsal.memory, files.num_bytes)
+    if config.train.strategy == "fsdp":
+        memory = memory.shared_out(rehearsal.ranks.world_size)
     name = torch.cuda.get_device_name(watch.device) if watch.device.type == "cuda" else "CPU"
     return replace(
         rehearsal,

@@ -4,7 +4,7 @@ import io
 import math
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean, median
 
 from rich.console import Console
@@ -61,6 +61,16 @@ class MemoryFacts:
         """Sum of the parts."""
         parts = self.weights + self.gradients + self.optimizer + self.others
         return parts + self.activations
+
+    def shared_out(self, num_processes: int) -> "MemoryFacts":
+        """What each process keeps where they share out all but the activations."""
+        return replace(
+            self,
+            weights=self.weights // num_processes,
+            gradients=self.gradients // num_processes,
+            optimizer=self.optimizer // num_processes,
+            others=self.others // num_processes,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -49,7 +49,6 @@ class StepWatch(Callback):
         self.keys: list[str] = []
         self.waited = 0.0
         self.step_ended = self.batch_ended = 0.0
-        self.optimizer_bytes = 0
         self.device = torch.device("cpu")
         self.used = (0, 0, 0)  # peak, and on a GPU reserved and capacity
 
@@ -104,9 +103,6 @@ class StepWatch(Callback):
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Measure memory while all is still on its device."""
-        states = trainer.optimizers[0].state.values()
-        tensors = [x for state in states for x in state.values() if isinstance(x, torch.Tensor)]
-        self.optimizer_bytes = sum(tensor.nbytes for tensor in tensors)
         self.used = (round(2**20 * resident_peak_mib()), 0, 0)
         if self.device.type == "cuda":
             own = (
@@ -117,18 +113,16 @@ class StepWatch(Callback):
             self.used = max(self.agreement.gather(own), key=lambda used: used[0] / used[2])
 
     def add_measured(self, memory: MemoryFacts, checkpoint_bytes: int) -> MemoryFacts:
-        """Put what was measured in the place of what was counted.
+        """Add what was measured to what was counted.
 
         Args:
-            memory: As counted before the steps.
+            memory: As counted before the steps, of a process that keeps all.
             checkpoint_bytes: Size of a checkpoint; 0 on processes that make none.
         """
-        known = memory.weights + self.optimizer_bytes
-        others = checkpoint_bytes - known
+        others = checkpoint_bytes - memory.weights - memory.optimizer
         peak, reserved, capacity = self.used
         return replace(
             memory,
-            optimizer=self.optimizer_bytes,
             # Configuration and counters are small.
             others=others if others > max(memory.weights // 4, 2**20) else 0,
             peak=peak,

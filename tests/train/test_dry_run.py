@@ -16,9 +16,11 @@ from l3r.errors import CheckpointError, ConfigError, DataError, LaunchError
 from l3r.train.dry_run import rehearse
 from l3r.train.first_reads import BatchRead
 from l3r.train.module import TrainModule
-from l3r.train.ranks import Ranks
-from l3r.train.rehearsal import Rehearsal, StepFacts
+from l3r.train.ranks import Agreement, Ranks
+from l3r.train.rehearsal import MemoryFacts, Rehearsal, StepFacts
 from l3r.train.run import train
+from l3r.train.signals import StopSignals
+from l3r.train.watch import StepWatch
 from tests.train.runs import layers
 
 ROOT = Path(__file__).parents[2]
@@ -188,9 +190,23 @@ def test_one_process_takes_the_share_of_one_where_devices_are_absent(hand_shards
     assert "one process in place of 8, with the share of one" in found.to_table()
 
 
+def test_what_a_checkpoint_holds_beside_weights_and_optimiser_is_counted():
+    """A moving average, as large as the weights; shared out over four processes."""
+    weights = 2**30
+    whole = MemoryFacts(weights=weights, gradients=weights, optimizer=2 * weights, activations=7)
+    config = load_config([])
+    watch = StepWatch(config, 1, StopSignals(), Agreement())
+    found = watch.add_measured(whole, 4 * weights + 1000)
+    assert found.others == weights + 1000
+    assert watch.add_measured(whole, 3 * weights + 1000).others == 0
+    assert found.shared_out(4).counted == 5 * weights // 4 + 250 + 7
+
+
 @pytest.mark.slow
-def test_two_processes_take_the_steps_and_one_tells(hand_shards, tmp_path):
-    done = command(*layers(hand_shards, tmp_path / "out", devices=2), "data.num_workers=1")
+@pytest.mark.parametrize("strategy", ["ddp", "fsdp"])
+def test_two_processes_take_the_steps_and_one_tells(hand_shards, tmp_path, strategy):
+    arguments = layers(hand_shards, tmp_path / "out", devices=2, strategy=strategy, ema_decay=0.9)
+    done = command(*arguments, "data.num_workers=1")
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("ready: ") == 1
     assert "CPU, 2 processes" in done.stdout
