@@ -72,4 +72,14 @@ done
 cpus=${SLURM_CPUS_PER_TASK:-1}
 printf '%s %s: %s processes on %s: l3r train %s\n' "$(date '+%F %T')" "$SLURM_JOB_ID" \
     "${SLURM_NTASKS:-1}" "$SLURM_JOB_NODELIST" "${layers[*]}" >&2
-exec srun --kill-on-bad-exit=1 --cpus-per-task="$cpus" l3r train "${layers[@]}"
+# A run in a container has no scontrol and makes this file, to be requeued from here. SIGTERM is for
+# the run, which saves; this shell waits for it.
+export L3R_REQUEUE_FILE=$SLURM_SUBMIT_DIR/.l3r-requeue-$SLURM_JOB_ID
+trap : TERM
+code=0
+srun --kill-on-bad-exit=1 --cpus-per-task="$cpus" l3r train "${layers[@]}" || code=$?
+if [[ -e $L3R_REQUEUE_FILE ]]; then
+    rm "$L3R_REQUEUE_FILE"
+    scontrol requeue "$SLURM_JOB_ID"
+fi
+exit "$code"

@@ -1,9 +1,11 @@
 """Signals that ask a run to stop: taken note of when they come, obeyed between two steps."""
 
 import os
+import shutil
 import signal
 import subprocess
 import threading
+from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -57,13 +59,20 @@ class StopSignals:
 def requeue_job() -> str:
     """Send this SLURM job back to the queue.
 
+    Containers have no ``scontrol``: there the file that ``L3R_REQUEUE_FILE`` names is made, which
+    asks the job's script to do it.
+
     Returns:
         What happened, as the end of a sentence.
     """
     job = os.environ["SLURM_JOB_ID"]
     if "SLURM_ARRAY_JOB_ID" in os.environ:
         job = f"{os.environ['SLURM_ARRAY_JOB_ID']}_{os.environ['SLURM_ARRAY_TASK_ID']}"
+    request = os.environ.get("L3R_REQUEUE_FILE")
     try:
+        if request and shutil.which("scontrol") is None:
+            Path(request).touch()
+            return f"job {job} is to be requeued by its script and goes on from there"
         done = subprocess.run(
             ["scontrol", "requeue", job], capture_output=True, text=True, timeout=60
         )

@@ -106,6 +106,28 @@ def test_a_job_that_is_signalled_requeues_itself_and_ends_as_if_it_had_not_stopp
     assert_same_run(tmp_path / "out", straight)
 
 
+def test_a_run_without_scontrol_as_in_a_container_is_requeued_by_its_script(
+    cluster, shards, straight, tmp_path
+):
+    tools = tmp_path / "bin"
+    tools.mkdir()
+    # What starts a container stands in the path under the command's name.
+    inside = f"PATH=/nowhere exec {sys.executable} -m l3r"
+    (tools / "l3r").write_text(f'#!/bin/sh\n{inside} "$@"\n')
+    (tools / "l3r").chmod(0o755)
+    site = tmp_path / "site.env"
+    site.write_text(f"export PATH={tools}:$PATH\n")
+    command = [SCRIPT, *layers(shards, tmp_path / "out")]
+    job = cluster.sbatch(*command, cwd=tmp_path, env={**LOCAL, "L3R_SITE_ENV": str(site)}, **TWO)
+    wait_for_step(cluster, job, 60)
+    cluster.signal(job, "USR1")
+    cluster.release(job)
+    cluster.wait(job, timeout=120)
+    assert f"job {job} is to be requeued by its script" in cluster.output(job)
+    assert not list(tmp_path.glob(".l3r-requeue-*"))
+    assert_same_run(tmp_path / "out", straight)
+
+
 def test_a_job_that_is_told_to_end_saves_and_the_same_command_goes_on(
     cluster, shards, straight, tmp_path
 ):

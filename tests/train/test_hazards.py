@@ -15,6 +15,7 @@ from l3r.errors import LaunchError
 from l3r.inference.checkpoint import read_checkpoint
 from l3r.loss.joint import JointLoss
 from l3r.train.run import train
+from l3r.train.signals import requeue_job
 from tests.data.graphs import make_graph, write_folder
 from tests.loss.scenes import random_views
 from tests.model.test_light3r import build
@@ -115,6 +116,17 @@ def test_processes_with_and_without_valid_pixels_wait_for_no_gradient(tmp_path):
     assert len(rows) == 8
     assert all(float(row["grad_norm"]) < float("inf") for row in rows)
     assert not (tmp_path / "run" / "bad_steps.jsonl").exists()
+
+
+def test_without_scontrol_the_script_of_the_job_is_asked(tmp_path, monkeypatch):
+    asked = tmp_path / "asked"
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("SLURM_JOB_ID", "70")
+    monkeypatch.setenv("L3R_REQUEUE_FILE", str(asked))
+    assert requeue_job() == "job 70 is to be requeued by its script and goes on from there"
+    assert asked.exists()
+    monkeypatch.setenv("L3R_REQUEUE_FILE", str(tmp_path / "nowhere" / "asked"))
+    assert "cannot be requeued" in requeue_job()
 
 
 REFUSES = "#!/bin/sh\necho 'no such job' >&2\nexit 1\n"
