@@ -6,12 +6,11 @@ from dataclasses import asdict
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 import jinja2
 import numpy as np
 
-from l3r.config import RunConfig
+from l3r.config import RunConfig, flatten_plain
 from l3r.export.durations import format_seconds
 from l3r.export.line_chart import Chart, Curve, Kind, draw_chart
 from l3r.export.run_folder import RunFolder, Table
@@ -60,7 +59,7 @@ def judge_run(run: RunFolder) -> str:
     share = f"step {step:,} of {total:,} ({100 * step / total:.0f} %)"
     if step >= total and run.is_complete:
         return f"finished: {share}"
-    rate = _recent_rate(run.training)
+    rate = recent_rate(run.training)
     graphs = run.config.data.graphs_per_step
     per_row = run.config.train.log_every * graphs / rate if rate else 0.0
     if run.idle_seconds > max(_MIN_IDLE, 5 * per_row):
@@ -74,7 +73,7 @@ def judge_run(run: RunFolder) -> str:
     return f"running: {share}{left}"
 
 
-def _recent_rate(training: Table) -> float:
+def recent_rate(training: Table) -> float:
     """Graphs per second, median of the last 20 rows; 0 where unknown."""
     rates = training.get("graphs_per_second", np.zeros(0))[-20:]
     rates = rates[np.isfinite(rates)]
@@ -175,19 +174,9 @@ def _pictures(paths: Sequence[Path]) -> list[dict[str, str]]:
 
 def _changes(config: RunConfig) -> list[tuple[str, str, str]]:
     """List what differs from the defaults: key, value, default."""
-    default = _flatten(asdict(RunConfig()))
+    default = flatten_plain(asdict(RunConfig()))
     return [
         (key, str(value), str(default.get(key, "-")))
-        for key, value in _flatten(asdict(config)).items()
+        for key, value in flatten_plain(asdict(config)).items()
         if value != default.get(key)
     ]
-
-
-def _flatten(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in plain.items():
-        if isinstance(value, Mapping):
-            flat |= _flatten(value, f"{prefix}{key}.")
-        else:
-            flat[prefix + key] = value
-    return flat
