@@ -47,7 +47,11 @@ def run(args: argparse.Namespace) -> int:
     if args.list:
         return 0
     from l3r.launch.run_sweep import SweepRunner
+    from l3r.launch.sweep_file import write_sweep
+    from l3r.launch.sweep_report import report_sweep
 
     share = sweep.share(args.task_index, args.tasks)
-    SweepRunner(sweep, jobs=args.jobs, launcher=shlex.split(args.launcher)).run(share)
-    return 0
+    write_sweep(sweep)
+    failed = SweepRunner(sweep, jobs=args.jobs, launcher=shlex.split(args.launcher)).run(share)
+    sys.stdout.write("\n" + report_sweep(sweep.out))
+    return 1 if failed else 0

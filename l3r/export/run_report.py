@@ -4,7 +4,6 @@ import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
-from importlib.resources import files
 from pathlib import Path
 
 import jinja2
@@ -27,10 +26,13 @@ _ACCURACY = {"rra_5": "RRA@5", "rra_15": "RRA@15", "rta_5": "RTA@5", "rta_15": "
 def render_run_report(run: RunFolder) -> str:
     """Give the report as HTML without scripts; all text from files is escaped."""
     environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=jinja2.PackageLoader("l3r.export", ""),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    source = files("l3r.export").joinpath("run_report.html").read_text(encoding="utf-8")
-    return environment.from_string(source).render(
+    return environment.get_template("run_report.html").render(
         version=__version__,
         name=run.path.resolve().name,
         note=run.config.train.note if run.config else "",

@@ -1,9 +1,9 @@
 """From a sweep file to its runs, and what makes their comparison fair."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -109,7 +109,7 @@ def expand(file: Path, extra: Sequence[str] = (), out: Path | None = None) -> Sw
         num_views = spec.evaluate.num_views or base.data.num_views
     _refuse_same_rows(file, changes)
     if spec.equal_images:
-        _require_equal_images(file, {run.row: run.config for run in runs if run.config})
+        require_equal_images(file, {run.row: run.config for run in runs if run.config})
     return Sweep(
         file=file,
         extra=tuple(extra),
@@ -124,25 +124,26 @@ def expand(file: Path, extra: Sequence[str] = (), out: Path | None = None) -> Sw
 def _trained_runs(
     spec: SweepConfig, extra: tuple[str, ...], folder: Path, base: RunConfig
 ) -> tuple[Changes, list[Run]]:
-    changes: Changes = {}
-    for row, added in spec.rows.items():
-        changes[row] = find_changes(base, load_config([*spec.base, *extra, *added]))
-        if found := [key for key in SET_BY_SWEEP if key in changes[row]]:
+    configs = {row: load_config([*spec.base, *extra, *added]) for row, added in spec.rows.items()}
+    changes = {row: find_changes(base, config) for row, config in configs.items()}
+    for row, changed in changes.items():
+        if found := [key for key in SET_BY_SWEEP if key in changed]:
             raise ConfigError(f"rows.{row} sets {found[0]}, which the sweep sets; leave it out")
     runs = []
     for seed in spec.seeds:
-        for row, added in spec.rows.items():
+        for row, config in configs.items():
             own = folder / row / f"seed_{seed}"
             place = (f"train.seed={seed}", f"train.output_dir={own}")
-            layers = (*spec.base, *extra, *added, *place)
             runs.append(
                 Run(
                     row=row,
                     seed=seed,
                     folder=own,
-                    layers=layers,
+                    layers=(*spec.base, *extra, *spec.rows[row], *place),
                     checkpoint=own / "model.ckpt",
-                    config=load_config(layers),
+                    config=replace(
+                        config, train=replace(config.train, seed=seed, output_dir=str(own))
+                    ),
                 )
             )
     return changes, runs
@@ -182,10 +183,10 @@ def _as_settings(layers: Sequence[str]) -> list[str]:
             settings.append(layer)
             continue
         try:
-            content = OmegaConf.to_container(OmegaConf.load(layer))
+            content = OmegaConf.to_container(OmegaConf.load(layer), resolve=True)
         except (OSError, OmegaConfBaseException, YAMLError) as error:
             raise ConfigError(f"layer {layer}: {str(error).splitlines()[0]}") from error
-        flat = flatten_plain(content if isinstance(content, dict) else {})
+        flat = flatten_plain(cast(dict[str, Any], content) if isinstance(content, dict) else {})
         settings += [f"{key}={value}" for key, value in flat.items()]
     return settings
 
@@ -201,8 +202,16 @@ def _refuse_same_rows(file: Path, changes: Changes) -> None:
             )
 
 
-def _require_equal_images(file: Path, configs: dict[str, RunConfig]) -> None:
-    """Refuse rows that no single number of images a step, rounded to whole graphs, would give."""
+def require_equal_images(file: Path, configs: dict[str, RunConfig]) -> None:
+    """Refuse rows that no single number of images a step, rounded to whole graphs, would give.
+
+    Args:
+        file: The sweep file, for the message.
+        configs: By row.
+
+    Raises:
+        ConfigError: They see more or fewer images than others.
+    """
     data = {row: config.data for row, config in configs.items()}
     lowest = max(((d.graphs_per_step - 0.5) * d.num_views for d in data.values()), default=0)
     highest = min(((d.graphs_per_step + 0.5) * d.num_views for d in data.values()), default=0)

@@ -169,7 +169,9 @@ def _last_bad_step(folder: RunFolder, max_bad_steps: int) -> str:
 
 
 def _require_same(path: Path, found: RunConfig, wanted: RunConfig) -> None:
-    if not (changes := find_changes(found, wanted)):
+    changes = find_changes(found, wanted)
+    changes.pop("train.output_dir", None)  # of a folder that was moved
+    if not changes:
         return
     # Brings torch, hence only where there is something to ask.
     from l3r.train.checkpointing import may_change

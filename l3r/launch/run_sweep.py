@@ -7,7 +7,6 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 from l3r.errors import LaunchError
@@ -51,10 +50,13 @@ class SweepRunner:
         self.progress = SweepProgress()
         self.active: list[_Active] = []
 
-    def run(self, runs: Sequence[Run]) -> None:
+    def run(self, runs: Sequence[Run]) -> list[str]:
         """Do the runs that are not over; those that others are at are left to them.
 
         A run that fails is noted, and the next one begins.
+
+        Returns:
+            Names of those that failed.
 
         Raises:
             KeyboardInterrupt: Asked to stop; the runs have saved where they are.
@@ -70,6 +72,7 @@ class SweepRunner:
             except BaseException:
                 self._stop()
                 raise
+        return [run.name for run in runs if self._state(run).kind == "failed"]
 
     def _begin(self, run: Run) -> None:
         state = self._state(run)
@@ -83,9 +86,9 @@ class SweepRunner:
         (run.folder / EXIT_CODE).unlink(missing_ok=True)
         # Without the note of a failure it may turn out to be trained.
         stage: Stage = "score" if self._state(run).kind == "trained" else "train"
-        self.active.append(self._start(run, stage, lock))
+        self.active.append(self._start(run, stage, lock, time.monotonic()))
 
-    def _start(self, run: Run, stage: Stage, lock: RunLock) -> _Active:
+    def _start(self, run: Run, stage: Stage, lock: RunLock, began: float) -> _Active:
         if stage == "train":
             command = [*self.launcher, *_L3R, "train", *run.layers]
         else:
@@ -107,7 +110,7 @@ class SweepRunner:
                 pass_fds=lock.descriptors,
             )
         self.progress.begin(run, stage)
-        return _Active(run=run, stage=stage, process=process, lock=lock, began=time.monotonic())
+        return _Active(run=run, stage=stage, process=process, lock=lock, began=began)
 
     def _look(self) -> None:
         """Wait a moment, then take note of the processes that have ended."""
@@ -122,7 +125,7 @@ class SweepRunner:
     def _settle(self, active: _Active, code: int) -> None:
         run = active.run
         if code == 0 and active.stage == "train":
-            self.active.append(self._start(run, "score", active.lock))
+            self.active.append(self._start(run, "score", active.lock, active.began))
             return
         if code and job_is_leaving():
             active.lock.release()
