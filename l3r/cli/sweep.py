@@ -24,6 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("layers", nargs="*", metavar="FILE.yaml|key=value", help="on top of its base")
     add("--out", type=Path, metavar="DIR", help="folder of all runs (output_dir of the file)")
     add("--list", action="store_true", help="print the runs and what they cost; run nothing")
+    add("--measure", action="store_true", help="first rehearse rows of which no step is measured")
+    add("--submit", action="store_true", help="submit an array of SLURM jobs for what is left")
     add("--jobs", type=int, default=1, metavar="K", help="runs at a time (1)")
     add("--tasks", type=int, default=1, metavar="K", help="tasks that share the runs (1)")
     add("--task-index", type=int, default=0, metavar="I", help="which of them this is, from 0")
@@ -32,26 +34,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run, or only say what would run."""
-    from l3r.launch.expand import expand
-    from l3r.launch.run_state import read_states
-    from l3r.launch.run_table import format_runs
+    """Run, submit, or only say what would run."""
+    from l3r.launch import sweep_job
 
-    sweep = expand(args.sweep, args.layers, args.out)
+    sweep = sweep_job.expand(args.sweep, args.layers, args.out)
     if args.score:
         from l3r.launch.score import score_run
 
         score_run(sweep, sweep.find(args.score))
         return 0
-    sys.stdout.write(format_runs(sweep, read_states(sweep)))
+    sys.stdout.write(sweep_job.list_runs(sweep, measure=args.measure))
     if args.list:
         return 0
-    from l3r.launch.run_sweep import SweepRunner
-    from l3r.launch.sweep_file import write_sweep
-    from l3r.launch.sweep_report import report_sweep
-
+    if args.submit:
+        sys.stdout.write(sweep_job.submit(sweep))
+        return 0
     share = sweep.share(args.task_index, args.tasks)
-    write_sweep(sweep)
-    failed = SweepRunner(sweep, jobs=args.jobs, launcher=shlex.split(args.launcher)).run(share)
-    sys.stdout.write("\n" + report_sweep(sweep.out))
+    launcher = shlex.split(args.launcher)
+    text, failed = sweep_job.run_share(sweep, share, jobs=args.jobs, launcher=launcher)
+    sys.stdout.write(f"\n{text}")
     return 1 if failed else 0

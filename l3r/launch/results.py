@@ -190,7 +190,9 @@ def _notes(paper: PaperTable | None, states: Collection[RunState]) -> list[str]:
         )
     if scored:
         found = scored[0]["identity"]
-        shown = " / ".join(format_score(found[metric], metric) for metric in METRICS)
+        shown = ", ".join(
+            f"{name} {format_score(found[metric], metric)}" for metric, name in METRICS.items()
+        )
         notes.append(
             "Validation columns: full inference on held-out graphs, pairs of unregistered images "
             f"count as failed; all cameras at one place would score {shown}."

@@ -18,10 +18,12 @@ Kind = Literal["new", "waiting", "begun", "trained", "scored", "diverged", "fail
 """``waiting``: for a checkpoint that others make. ``begun``: under way, or to be gone on with."""
 OVER: tuple[Kind, ...] = ("scored", "diverged")
 """What is not begun again."""
-EXIT_CODE = "exit_code"
-"""File in a run's folder with the exit code of a process that failed."""
+FAILURE = "failure.txt"
+"""File in a run's folder that says why a process of it failed."""
 LOG = "log.txt"
 """File with what a run's processes said."""
+_NOT_FINITE = "not finite"
+"""Words of every error of a training whose numbers have left the finite."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,10 +72,12 @@ def read_state(run: Run, request: Mapping[str, Any]) -> RunState:
         ConfigError: Its folder holds a run of another configuration.
     """
     state = _trained_state(run) if run.config is not None else _scored_state(run)
-    exit_code = run.folder / EXIT_CODE
-    if state.kind in ("new", "begun", "trained") and exit_code.is_file():
-        code = exit_code.read_text().strip()
-        return replace(state, kind="failed", detail=f"exit code {code}, see {run.folder / LOG}")
+    failure = run.folder / FAILURE
+    if state.kind in ("new", "begun", "trained") and failure.is_file():
+        said = failure.read_text().strip()
+        if _NOT_FINITE in said:
+            return replace(state, kind="diverged", detail=said)
+        return replace(state, kind="failed", detail=f"{said}; see {run.folder / LOG}")
     if state.kind != "trained":
         return state
     scores = read_scores(run, request)

@@ -1,7 +1,7 @@
 """Stands in for ``python -m l3r`` where the runner is tested: leaves files, learns nothing.
 
-What a run does is said in the folder of the sweep: ``ROW-SEED.txt`` holds ``die``, ``diverge`` or
-``wait``. Every call is written down in ``calls.txt``.
+What a run does is said in the folder of the sweep: ``ROW-SEED.txt`` holds ``die``, ``diverge``,
+``explode`` or ``wait``. Every call is written down in ``calls.txt``.
 """
 
 import signal
@@ -36,7 +36,11 @@ def main(words):
         (out / "waiting").touch()
         time.sleep(60)
     if what == "die":
+        sys.stderr.write("out of luck\n")
         return 1
+    if what == "explode":
+        sys.stderr.write("l3r train: scores are not finite\nsrun: error: task 0: exit code 2\n")
+        return 2
     if what == "diverge":
         note_bad_steps(run, [7, 8, 9])
         return 2

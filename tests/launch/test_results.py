@@ -14,7 +14,7 @@ from l3r.errors import DataError
 from l3r.launch.expand import expand
 from l3r.launch.paper_tables import METRICS, PAPER_TABLES
 from l3r.launch.results import best_of_paper, best_rows, collect_results, spread_of
-from l3r.launch.run_state import EXIT_CODE, read_states, scoring_request
+from l3r.launch.run_state import FAILURE, read_states, scoring_request
 from l3r.launch.sweep_file import write_sweep
 from l3r.launch.sweep_markdown import format_spread, render_markdown
 from l3r.launch.sweep_report import mean_table, report_sweep
@@ -53,7 +53,7 @@ def test_the_table_is_as_recorded(done):
     undo(diverged)
     note_bad_steps(diverged, [30, 31, 32])
     undo(failed)
-    (failed.folder / EXIT_CODE).write_text("1\n")
+    (failed.folder / FAILURE).write_text("exit code 1: l3r train: no room\n")
     states = read_states(done)
     text = render_markdown(collect_results(done, states)).replace(str(done.out), "OUT")
     assert text == GOLDEN.read_text()

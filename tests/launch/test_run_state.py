@@ -4,7 +4,7 @@ import pytest
 
 from l3r.errors import ConfigError
 from l3r.launch.expand import expand
-from l3r.launch.run_state import EXIT_CODE, read_state, read_states, scoring_request
+from l3r.launch.run_state import FAILURE, read_state, read_states, scoring_request
 from l3r.launch.run_table import estimate_steps, format_runs
 from tests.launch.sweeps import note_bad_steps, score_by_hand, train_by_hand, write_sweep_file
 
@@ -62,8 +62,8 @@ def test_weights_that_are_not_finite_are_diverged(sweep, state):
 def test_a_failed_run_says_where_its_log_is(sweep, state):
     run = sweep.runs[0]
     train_by_hand(run, steps=3)
-    (run.folder / EXIT_CODE).write_text("137\n")
-    assert state().describe() == f"failed: exit code 137, see {run.folder / 'log.txt'}"
+    (run.folder / FAILURE).write_text("exit code 137: Killed\n")
+    assert state().describe() == f"failed: exit code 137: Killed; see {run.folder / 'log.txt'}"
 
 
 def test_a_longer_training_goes_on_and_another_one_is_refused(sweep, tmp_path):

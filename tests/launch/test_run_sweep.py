@@ -63,12 +63,20 @@ def test_a_run_that_dies_or_diverges_ends_no_other_and_only_the_dead_is_tried_ag
     (two.out / "paper-0.txt").write_text("diverge")
     assert SweepRunner(two).run(two.runs) == ["none/seed_0"]
     assert kinds(two) == ["failed", "diverged", "scored", "scored"]
-    assert "exit code 1, see" in read_states(two)["none/seed_0"].describe()
+    assert "exit code 1: out of luck; see" in read_states(two)["none/seed_0"].describe()
     assert "$ " in (two.runs[0].folder / "log.txt").read_text()
     (two.out / "none-0.txt").unlink()
     assert SweepRunner(two).run(two.runs) == []
     assert kinds(two) == ["scored", "diverged", "scored", "scored"]
     assert calls(two).count("train paper/seed_0") == 1
+
+
+def test_a_run_whose_weights_explode_between_two_steps_is_diverged(two):
+    (two.out / "none-0.txt").write_text("explode")
+    assert SweepRunner(two).run(two.runs[:1]) == []
+    assert read_states(two)["none/seed_0"].describe() == (
+        "diverged: exit code 2: l3r train: scores are not finite"
+    )
 
 
 def test_a_run_that_another_process_is_at_is_left_to_it(two, capsys):
