@@ -22,8 +22,8 @@ FAILURE = "failure.txt"
 """File in a run's folder that says why a process of it failed."""
 LOG = "log.txt"
 """File with what a run's processes said."""
-_NOT_FINITE = "not finite"
-"""Words of every error of a training whose numbers have left the finite."""
+_EXPLODED = "similarity scores are not finite"
+"""What a training ends with whose weights left the finite in between two steps."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +75,7 @@ def read_state(run: Run, request: Mapping[str, Any]) -> RunState:
     failure = run.folder / FAILURE
     if state.kind in ("new", "begun", "trained") and failure.is_file():
         said = failure.read_text().strip()
-        if _NOT_FINITE in said:
+        if _EXPLODED in said:
             return replace(state, kind="diverged", detail=said)
         return replace(state, kind="failed", detail=f"{said}; see {run.folder / LOG}")
     if state.kind != "trained":
