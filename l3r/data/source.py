@@ -37,11 +37,7 @@ class ShardFolder:
         self.shards = manifest.shards
         with ThreadPoolExecutor(MAX_CONNECTIONS) as pool:
             indices = list(pool.map(self.store.read_index, self.shards))
-        stored = [
-            (number, entry)
-            for number, index in enumerate(indices)
-            for entry in index.graphs
-        ]
+        stored = [(number, entry) for number, index in enumerate(indices) for entry in index.graphs]
         first, last = (round(share * len(stored)) for share in span)
         taken = [(n, entry) for n, entry in stored[first:last] if entry.num_views >= num_views]
         if not taken:

@@ -42,8 +42,10 @@ def measure_rows(sweep: Sweep, states: Mapping[str, RunState]) -> dict[str, floa
 def main(layers: Sequence[str]) -> int:
     """Rehearse one run and print the seconds of a step."""
     try:
+        config = load_config(layers)
+        # By name: it brings torch, which the rest of this module does not need.
         rehearse = importlib.import_module("l3r.train.dry_run").rehearse
-        seconds = float(rehearse(load_config(layers)).step_seconds)
+        seconds = float(rehearse(config).step_seconds)
     except L3RError as error:
         sys.stderr.write(f"rehearsal: {error}\n")
         return 2

@@ -63,9 +63,9 @@ def test_an_array_does_a_sweep_whatever_becomes_of_its_tasks(cluster, sweep_file
     # A process that is killed costs its run, and the task goes on with its next one.
     wait_for_step(first.folder, 30)
     os.kill(find_training(cluster, first.folder), 9)
-    # A task that is asked to saves, and goes back to the queue by itself.
+    # A task near its time limit gets a signal, lets its training save, and is requeued.
     wait_for_step(second.folder, 30)
-    cluster.signal(f"{job}_1", "USR1")
+    cluster.run("scancel", "--batch", "--signal=USR1", f"{job}_1")
     cluster.release(f"{job}_1")
     cluster.wait(f"{job}_0", "FAILED", timeout=180)
     states = read_states(sweep)
