@@ -37,11 +37,15 @@ def format_runs(
         measured: Seconds of a step by row, for rows of which no run has begun.
     """
     step_seconds = estimate_steps(sweep, states, measured)
+    known = [state.num_devices for state in states.values() if state.num_devices is not None]
     header = ("run", "differs from the base in", "state", "hours", "GPU hours")
     rows = [header]
     left, gpu_left, unknown = 0.0, 0.0, 0
     for run in sweep.runs:
         state = states[run.name]
+        # A run that has not begun will have as many GPUs as others had.
+        is_begun = state.step_seconds is not None
+        devices = state.num_devices if is_begun else max(known, default=None)
         changed = sweep.changes[run.row]
         words = ", ".join(f"{key}={new}" for key, (_, new) in changed.items()) or "nothing"
         whole = _hours(state, step_seconds.get(run.row), 0)
@@ -49,8 +53,7 @@ def format_runs(
         if state.kind in ("new", "begun", "failed"):
             unknown += rest is None
             left += rest or 0.0
-            gpu_left += (rest or 0.0) * (state.num_devices or 0)
-        devices = state.num_devices
+            gpu_left += (rest or 0.0) * (devices or 0)
         gpu = None if whole is None or devices is None else whole * devices
         rows.append((run.name, words, state.describe(), _cell(whole), _cell(gpu)))
     widths = [max(len(row[column]) for row in rows) for column in range(len(header))]

@@ -53,7 +53,8 @@ def score_run(sweep: Sweep, run: Run) -> dict[str, Any]:
     if not _is_finite(model):
         content["problem"] = "weights are not finite"
     else:
-        content |= _score_sources(sweep, model, config)
+        # Shards may have moved since the training.
+        content |= _score_sources(sweep, model, config, run.config or config)
     run.folder.mkdir(parents=True, exist_ok=True)
     write_atomic(run.folder / "scores.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
     return content
@@ -87,11 +88,13 @@ def open_scored(sweep: Sweep, config: RunConfig) -> dict[str, ShardFolder]:
     }
 
 
-def _score_sources(sweep: Sweep, model: Light3R, config: RunConfig) -> dict[str, Any]:
+def _score_sources(
+    sweep: Sweep, model: Light3R, config: RunConfig, data: RunConfig
+) -> dict[str, Any]:
     max_graphs = sweep.spec.evaluate.max_graphs
     scores: dict[str, GraphScores] = {}
     plain: dict[str, Any] = {}
-    for name, shards in open_scored(sweep, config).items():
+    for name, shards in open_scored(sweep, data).items():
         scores[name] = evaluate_opened(model, config.inference, shards, max_graphs=max_graphs)
         found = _fingerprint(shards, scores[name].num_graphs)
         plain[name] = {**scores[name].to_plain(), "graphs_sha256": found}

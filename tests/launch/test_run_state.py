@@ -114,8 +114,8 @@ def test_the_table_of_runs_has_hours_from_the_steps_of_the_same_row(sweep):
     assert lines[4].split("  ")[0] == "0.1/seed_1"
     assert "trained, not scored" in lines[4]
     assert lines[4].split()[-2:] == ["14", "-"]
-    # Half of one run and two whole ones of a row, and two of the other.
-    assert lines[-1].endswith("left: 97 hours, 111 GPU hours")
+    # Half of one run and two whole ones of a row, and two of the other; the one on a CPU is done.
+    assert lines[-1].endswith("left: 97 hours, 778 GPU hours")
     assert format_runs(sweep, {}.fromkeys(states, states["0.1/seed_0"])).endswith(
         "6 runs (6 new); left: 0.00 hours, and 6 runs of which no step was measured\n"
     )
