@@ -132,7 +132,7 @@ def digits_of(metric: str) -> int:
 
 
 def _best(values: Mapping[str, float], metric: str) -> set[str]:
-    if len(values) < 2:
+    if len(set(values.values())) < 2:
         return set()
     best = (min if metric in LOWER_IS_BETTER else max)(values.values())
     return {row for row, value in values.items() if value == best}
