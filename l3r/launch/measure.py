@@ -4,7 +4,6 @@ A program of its own, because a rehearsal on several devices starts its other pr
 command line of this one.
 """
 
-import importlib
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -43,9 +42,10 @@ def main(layers: Sequence[str]) -> int:
     """Rehearse one run and print the seconds of a step."""
     try:
         config = load_config(layers)
-        # By name: it brings torch, which the rest of this module does not need.
-        rehearse = importlib.import_module("l3r.train.dry_run").rehearse
-        seconds = float(rehearse(config).step_seconds)
+        # It brings torch, which the rest of this module does not need.
+        from l3r.train.dry_run import rehearse
+
+        seconds = rehearse(config).step_seconds
     except L3RError as error:
         sys.stderr.write(f"rehearsal: {error}\n")
         return 2
