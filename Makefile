@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: install demo test test-slow test-slurm lint fmt types arch check bench
+.PHONY: install demo sweep-tiny test test-slow test-slurm lint fmt types arch check bench
 
 install: $(STAMP)
 
@@ -16,6 +16,10 @@ $(STAMP): pyproject.toml constraints.txt
 
 demo: install
 	PATH="$(CURDIR)/$(BIN):$$PATH" bash demo/run.sh
+
+# The paper's ablations on synthetic rooms; an hour or two on two cores, and resumable.
+sweep-tiny: install
+	PATH="$(CURDIR)/$(BIN):$$PATH" bash demo/sweeps.sh
 
 test: install
 	$(BIN)/python -m pytest

@@ -13,7 +13,8 @@ from l3r.version import __version__
 COMMANDS = {
     "config": "show exactly what a run would use",
     "train": "train a network, or go on where a run stopped",
-    "report": "draw how a training run goes",
+    "sweep": "train and score many runs, and print the paper's table",
+    "report": "draw how a training run or a sweep goes",
     "reconstruct": "reconstruct a folder of photos",
     "eval poses": "score cameras against trusted ones",
     "eval graphs": "score a checkpoint on validation shards",

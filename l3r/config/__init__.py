@@ -1,9 +1,17 @@
 """Typed configuration in layers; imports no torch."""
 
+from l3r.config.compare import find_changes, flatten_plain
 from l3r.config.data import DataConfig, SourceConfig
 from l3r.config.graph import GraphConfig
 from l3r.config.inference import InferenceConfig
-from l3r.config.layers import from_plain, load_config, override_config, to_plain, to_yaml
+from l3r.config.layers import (
+    from_plain,
+    load_config,
+    load_other,
+    override_config,
+    to_plain,
+    to_yaml,
+)
 from l3r.config.logs import LogsConfig
 from l3r.config.loss import LossConfig
 from l3r.config.model import (
@@ -32,8 +40,11 @@ __all__ = [
     "RunConfig",
     "SourceConfig",
     "TrainConfig",
+    "find_changes",
+    "flatten_plain",
     "from_plain",
     "load_config",
+    "load_other",
     "override_config",
     "to_plain",
     "to_yaml",

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -11,6 +11,8 @@ from yaml import YAMLError
 
 from l3r.config.run import RunConfig
 from l3r.errors import ConfigError
+
+T = TypeVar("T")
 
 
 def load_config(layers: Sequence[str]) -> RunConfig:
@@ -28,7 +30,20 @@ def load_config(layers: Sequence[str]) -> RunConfig:
         config = _merge_override(config, layer) if "=" in layer else _merge_file(config, layer)
     if missing := sorted(OmegaConf.missing_keys(config)):
         raise ConfigError(f"no value for {', '.join(missing)}; give one as key=value")
-    return _to_object(config, "layers")
+    return cast(RunConfig, _to_object(config, "layers"))
+
+
+def load_other(path: str, schema: type[T]) -> T:
+    """Read a YAML file of another kind than a run's, with the same checks and messages.
+
+    Args:
+        path: The file.
+        schema: Its dataclass.
+
+    Raises:
+        ConfigError: See :func:`load_config`.
+    """
+    return cast(T, _to_object(_merge_file(OmegaConf.structured(schema), path), path))
 
 
 def override_config(
@@ -52,7 +67,7 @@ def override_config(
                 f"{sections[0]}.KEY=VALUE"
             )
         merged = _merge_override(cast(DictConfig, merged), override)
-    return _to_object(cast(DictConfig, merged), "overrides")
+    return cast(RunConfig, _to_object(cast(DictConfig, merged), "overrides"))
 
 
 def to_plain(config: RunConfig) -> dict[str, Any]:
@@ -77,7 +92,7 @@ def from_plain(plain: Mapping[str, Any], where: str) -> RunConfig:
         config = OmegaConf.merge(OmegaConf.structured(RunConfig), dict(plain))
     except OmegaConfBaseException as error:
         raise ConfigError(f"{where}: {_first_line(error)}") from error
-    return _to_object(cast(DictConfig, config), where)
+    return cast(RunConfig, _to_object(cast(DictConfig, config), where))
 
 
 def to_yaml(config: RunConfig) -> str:
@@ -119,9 +134,9 @@ def _merge_override(config: DictConfig, override: str) -> DictConfig:
         raise ConfigError(f"override '{override}': {_first_line(error)}") from error
 
 
-def _to_object(config: DictConfig, where: str) -> RunConfig:
+def _to_object(config: DictConfig, where: str) -> object:
     try:
-        return cast(RunConfig, OmegaConf.to_object(config))
+        return OmegaConf.to_object(config)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from error
     except OmegaConfBaseException as error:

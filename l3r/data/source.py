@@ -20,7 +20,8 @@ class ShardFolder:
     Args:
         place: A folder with ``manifest.json`` and the tars, or a store of such.
         num_views: Graphs with fewer images are left out.
-        span: (first, last) share of the others that is taken, in stored order.
+        span: (first, last) share of all stored graphs that is taken, in stored order: what is held
+            out for one number of images is held out for all.
 
     Raises:
         DataError: The place holds no finished shards, or no graph of so many images.
@@ -36,14 +37,9 @@ class ShardFolder:
         self.shards = manifest.shards
         with ThreadPoolExecutor(MAX_CONNECTIONS) as pool:
             indices = list(pool.map(self.store.read_index, self.shards))
-        stored = [
-            (number, entry)
-            for number, index in enumerate(indices)
-            for entry in index.graphs
-            if entry.num_views >= num_views
-        ]
+        stored = [(number, entry) for number, index in enumerate(indices) for entry in index.graphs]
         first, last = (round(share * len(stored)) for share in span)
-        taken = stored[first:last]
+        taken = [(n, entry) for n, entry in stored[first:last] if entry.num_views >= num_views]
         if not taken:
             raise DataError(
                 f"{self.store.place}: no graph of {num_views} images in the span {list(span)};"

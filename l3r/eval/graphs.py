@@ -4,6 +4,7 @@ import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from rich.console import Console
@@ -47,7 +48,11 @@ class GraphScores:
 
     def write_json(self, path: Path) -> None:
         """Write all metrics."""
-        plain = {
+        write_atomic(path, json.dumps(self.to_plain(), indent=2, allow_nan=False) + "\n")
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain numbers, for JSON."""
+        return {
             "network": self.network.to_plain(),
             "identity": self.identity.to_plain(),
             "num_graphs": self.num_graphs,
@@ -55,7 +60,6 @@ class GraphScores:
             "seconds": self.seconds,
             "missing": "fail",
         }
-        write_atomic(path, (json.dumps(plain, indent=2, allow_nan=False) + "\n").encode())
 
 
 def evaluate_shards(
@@ -81,7 +85,27 @@ def evaluate_shards(
     """
     require(num_views >= 2, "--num-views", num_views, "2 or more")
     require(max_graphs is None or max_graphs >= 1, "--max-graphs", max_graphs, "1 or more")
-    shards = ShardFolder(folder, num_views)
+    return evaluate_opened(model, config, ShardFolder(folder, num_views), max_graphs=max_graphs)
+
+
+def evaluate_opened(
+    model: Light3R,
+    config: InferenceConfig,
+    shards: ShardFolder,
+    *,
+    max_graphs: int | None = None,
+) -> GraphScores:
+    """Do what :func:`evaluate_shards` does with shards that are open, or a span of them.
+
+    Args:
+        model: The network.
+        config: Camera fitting.
+        shards: Graphs, and how many images of each.
+        max_graphs: The first so many are used; by default all.
+
+    Raises:
+        DataError: The shards cannot be read.
+    """
     count = len(shards) if max_graphs is None else min(max_graphs, len(shards))
     size = (model.config.image_size[0], model.config.image_size[1])
     device = next(model.parameters()).device
@@ -96,6 +120,6 @@ def evaluate_shards(
         network=mean_metrics(network),
         identity=mean_metrics(identity),
         num_graphs=count,
-        num_views=num_views,
+        num_views=shards.num_views,
         seconds=time.perf_counter() - began,
     )

@@ -4,14 +4,12 @@ import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
-from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 import jinja2
 import numpy as np
 
-from l3r.config import RunConfig
+from l3r.config import RunConfig, flatten_plain
 from l3r.export.durations import format_seconds
 from l3r.export.line_chart import Chart, Curve, Kind, draw_chart
 from l3r.export.run_folder import RunFolder, Table
@@ -28,10 +26,13 @@ _ACCURACY = {"rra_5": "RRA@5", "rra_15": "RRA@15", "rta_5": "RTA@5", "rta_15": "
 def render_run_report(run: RunFolder) -> str:
     """Give the report as HTML without scripts; all text from files is escaped."""
     environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=jinja2.PackageLoader("l3r.export", ""),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    source = files("l3r.export").joinpath("run_report.html").read_text(encoding="utf-8")
-    return environment.from_string(source).render(
+    return environment.get_template("run_report.html").render(
         version=__version__,
         name=run.path.resolve().name,
         note=run.config.train.note if run.config else "",
@@ -60,7 +61,7 @@ def judge_run(run: RunFolder) -> str:
     share = f"step {step:,} of {total:,} ({100 * step / total:.0f} %)"
     if step >= total and run.is_complete:
         return f"finished: {share}"
-    rate = _recent_rate(run.training)
+    rate = recent_rate(run.training)
     graphs = run.config.data.graphs_per_step
     per_row = run.config.train.log_every * graphs / rate if rate else 0.0
     if run.idle_seconds > max(_MIN_IDLE, 5 * per_row):
@@ -74,7 +75,7 @@ def judge_run(run: RunFolder) -> str:
     return f"running: {share}{left}"
 
 
-def _recent_rate(training: Table) -> float:
+def recent_rate(training: Table) -> float:
     """Graphs per second, median of the last 20 rows; 0 where unknown."""
     rates = training.get("graphs_per_second", np.zeros(0))[-20:]
     rates = rates[np.isfinite(rates)]
@@ -175,19 +176,9 @@ def _pictures(paths: Sequence[Path]) -> list[dict[str, str]]:
 
 def _changes(config: RunConfig) -> list[tuple[str, str, str]]:
     """List what differs from the defaults: key, value, default."""
-    default = _flatten(asdict(RunConfig()))
+    default = flatten_plain(asdict(RunConfig()))
     return [
         (key, str(value), str(default.get(key, "-")))
-        for key, value in _flatten(asdict(config)).items()
+        for key, value in flatten_plain(asdict(config)).items()
         if value != default.get(key)
     ]
-
-
-def _flatten(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in plain.items():
-        if isinstance(value, Mapping):
-            flat |= _flatten(value, f"{prefix}{key}.")
-        else:
-            flat[prefix + key] = value
-    return flat

@@ -11,7 +11,7 @@ import lightning as L
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from lightning.pytorch.callbacks import Checkpoint
 
-from l3r.config import RunConfig, from_plain, to_plain
+from l3r.config import RunConfig, find_changes, from_plain
 from l3r.errors import CheckpointError, ConfigError, LaunchError
 from l3r.files import hidden_sibling, hidden_siblings
 from l3r.inference.checkpoint import read_checkpoint
@@ -250,11 +250,9 @@ def fit_progress(checkpoint: dict[str, Any], accumulate: int) -> None:
 
 def _require_same_run(path: Path, content: Mapping[str, Any], config: RunConfig) -> None:
     # Keys that are younger than the checkpoint count as their defaults.
-    before = _flatten(to_plain(from_plain(content["l3r_config"], str(path))))
-    now = _flatten(to_plain(config))
-    for key in sorted(before.keys() | now.keys()):
-        old, new = before.get(key), now.get(key)
-        if old != new and not _is_free(key, config):
+    before = from_plain(content["l3r_config"], str(path))
+    for key, (old, new) in find_changes(before, config).items():
+        if not may_change(key, config):
             raise ConfigError(
                 f"{path}: made with {key}={old}, this run has {new}; "
                 "give that value, or another train.output_dir"
@@ -263,19 +261,10 @@ def _require_same_run(path: Path, content: Mapping[str, Any], config: RunConfig)
         raise CheckpointError(f"{path}: is past train.max_steps={config.train.max_steps}")
 
 
-def _is_free(key: str, config: RunConfig) -> bool:
+def may_change(key: str, config: RunConfig) -> bool:
+    """Tell whether a resumed run may have another value of a key than its checkpoint."""
     if key == "train.max_steps":
         return config.train.schedule == "constant"
     # Shards may move; logs and inference change nothing that is learnt.
-    may_change = key.endswith(".shards") or key.startswith(("inference.", "logs."))
-    return key in FREE_TO_CHANGE or may_change
-
-
-def _flatten(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in plain.items():
-        if isinstance(value, Mapping):
-            flat |= _flatten(value, f"{prefix}{key}.")
-        else:
-            flat[prefix + key] = value
-    return flat
+    is_elsewhere = key.endswith(".shards") or key.startswith(("inference.", "logs."))
+    return key in FREE_TO_CHANGE or is_elsewhere

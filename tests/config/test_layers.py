@@ -12,7 +12,7 @@ from l3r.errors import ConfigError
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 BASE = str(CONFIGS / "base.yaml")
-FILES = sorted(CONFIGS.rglob("*.yaml"))
+FILES = sorted(path for path in CONFIGS.rglob("*.yaml") if path.parent.name != "sweep")
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(CONFIGS)))

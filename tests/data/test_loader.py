@@ -172,6 +172,14 @@ def test_a_span_takes_a_share_of_the_graphs_and_its_complement_the_rest(shards):
         SourceConfig(shards="x", span=[0.5, 0.5])
 
 
+def test_what_a_span_holds_out_for_one_number_of_images_it_holds_out_for_all(tmp_path):
+    graphs = [make_graph(n, num_views=8 if n < 5 else 3, height=16, width=16) for n in range(10)]
+    folder = write_folder(tmp_path, graphs)
+    kept, held = ShardFolder(folder, 3, (0.0, 0.4)), ShardFolder(folder, 8, (0.4, 1.0))
+    assert (len(kept), len(held)) == (4, 1)
+    assert not {kept.key(i) for i in range(4)} & {held.key(0)}
+
+
 class Unreadable(ShardFolder):
     """Writes down what it is asked for."""
 

@@ -1,0 +1,61 @@
+"""What a sweep asks of SLURM."""
+
+import os
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+
+from l3r.errors import LaunchError
+from l3r.launch.expand import Sweep
+from l3r.launch.run_state import RunState
+
+SCRIPT = Path("slurm/sweep.sh")
+
+
+def submit_sweep(sweep: Sweep, states: Mapping[str, RunState]) -> str:
+    """Submit an array with a task for each run that is not over.
+
+    Args:
+        sweep: The sweep.
+        states: Of its runs, by name.
+
+    Returns:
+        What ``sbatch`` said, or that there is nothing to do.
+
+    Raises:
+        LaunchError: There is no script or no SLURM here, or it refuses the job.
+    """
+    left = [
+        number
+        for number, run in enumerate(sweep.runs)
+        if states[run.name].kind in ("new", "begun", "trained", "failed")
+    ]
+    if not left:
+        return "nothing to submit: no run is left to do"
+    if not SCRIPT.is_file():
+        raise LaunchError(f"{SCRIPT}: no such file; run this in the folder of the project")
+    array = ",".join(map(str, left))
+    sweep_words = (str(sweep.file), *sweep.extra, "--out", str(sweep.out))
+    command = ["sbatch", f"--array={array}", str(SCRIPT), *sweep_words]
+    try:
+        done = subprocess.run(
+            [*command, "--tasks", str(len(sweep.runs))], capture_output=True, text=True
+        )
+    except OSError as error:
+        raise LaunchError(f"sbatch: {error.strerror}; run this where jobs are submitted") from error
+    if done.returncode:
+        raise LaunchError(f"sbatch refuses the job: {done.stderr.strip().splitlines()[-1]}")
+    return f"{done.stdout.strip()}: {len(left)} tasks, a run each"
+
+
+def job_is_leaving() -> bool:
+    """Tell whether this process is part of a SLURM job that no longer runs: requeued, cancelled."""
+    job = os.environ.get("SLURM_JOB_ID")
+    if job is None:
+        return False
+    command = ["squeue", "--noheader", f"--jobs={job}", "--format=%T"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return done.returncode == 0 and done.stdout.strip() != "RUNNING"
