@@ -4,6 +4,7 @@ import math
 import os
 import shutil
 import tempfile
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -164,7 +165,7 @@ def _try_steps(
         tell(f"taking steps, the first at {sizes[0][0]}x{sizes[0][1]}")
     agreement = Agreement()
     files = MeasuredFiles(config.train.accumulate)
-    with tempfile.TemporaryDirectory(prefix="l3r-dry-run-") as folder, StopSignals() as signals:
+    with _open_folder(here) as folder, StopSignals() as signals:
         config.train.output_dir = folder
         watch = StepWatch(config, STEPS_OF_A_SHAPE * len(sizes), signals, agreement)
         callbacks = build_callbacks(config, signals, [], agreement)
@@ -185,6 +186,13 @@ def _try_steps(
         memory=memory,
         checkpoint_bytes=files.num_bytes,
     )
+
+
+def _open_folder(here: Ranks) -> AbstractContextManager[str]:
+    """Make a folder for what the first process writes; others, which srun may kill, need none."""
+    if here.is_first:
+        return tempfile.TemporaryDirectory(prefix="l3r-dry-run-")
+    return nullcontext(os.devnull)
 
 
 def _find_room(folder: Path) -> int:

@@ -52,8 +52,8 @@ def straight(shards, tmp_path_factory):
     return out
 
 
-def submit(cluster, shards, tmp_path, *more, options=TWO, **train):
-    arguments = [*layers(shards, tmp_path / "out", **train), *more]
+def submit(cluster, shards, tmp_path, *, options=TWO, **train):
+    arguments = layers(shards, tmp_path / "out", **train)
     return cluster.sbatch(SCRIPT, *arguments, cwd=tmp_path, env=LOCAL, **options)
 
 
@@ -79,16 +79,25 @@ def assert_same_run(out, straight):
 def test_a_dry_run_takes_its_steps_on_all_nodes_and_leaves_nothing_but_its_answer(
     cluster, shards, tmp_path
 ):
-    job = submit(cluster, shards, tmp_path, "--dry-run")
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    env = {**LOCAL, "TMPDIR": str(temporary)}
+
+    def rehearse(place):
+        arguments = [*layers(place, tmp_path / "out"), "--dry-run"]
+        return cluster.sbatch(SCRIPT, *arguments, cwd=tmp_path, env=env, **TWO)
+
+    job = rehearse(shards)
     cluster.wait(job, timeout=120)
     said = cluster.output(job)
     assert said.count(f"ready: {STEPS} steps to take") == 1
     assert "CPU, 2 processes" in said
     assert said.count("dry run: step 1 ") == 1
-    assert not (tmp_path / "out").exists()
-    job = submit(cluster, tmp_path / "nowhere", tmp_path, "--dry-run")
+    job = rehearse(tmp_path / "nowhere")
     cluster.wait(job, "FAILED", timeout=120)
     assert cluster.output(job).count("nowhere/manifest.json: no such file") == 1
+    assert not (tmp_path / "out").exists()
+    assert not [*temporary.glob("l3r-*")]
 
 
 def test_a_job_that_is_signalled_requeues_itself_and_ends_as_if_it_had_not_stopped(
