@@ -37,7 +37,7 @@ PARTS = {
     **FORWARD,
     "loss": ["l3r.loss.joint.JointLoss.forward"],
     "backward": ["lightning.pytorch.strategies.strategy.Strategy.backward"],
-    "optimiser": ["torch.optim.AdamW.step"],
+    "optimiser": ["torch.optim.AdamW.step", "l3r.train.ema.WeightAverage.on_train_batch_end"],
     "rest": ["lightning.pytorch.loops.optimization.automatic.Closure.__call__"],
 }
 """What is timed as which part. ``data`` is also the wait for the loader; the optimiser's step

@@ -13,12 +13,13 @@ image size. Medians. On a GPU times are those of the device (``benchmarks/step_c
 
 import argparse
 import gc
+import io
 import statistics
 import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,6 +31,7 @@ from benchmarks.made_shards import write_shards
 from benchmarks.model import matmul_rate
 from benchmarks.step_clock import PARTS, StepClock
 from l3r.config import RunConfig, load_config
+from l3r.model.precision import set_tf32, true_float32
 from l3r.train.run import train
 
 GRAPHS = 16
@@ -131,6 +133,7 @@ def prepared(layers: Sequence[str]) -> Iterator[RunConfig]:
         parts = (own.devices or 1) * (own.num_nodes or 1)
         config.data.graphs_per_step = -(-config.data.graphs_per_step // parts)
         own.devices = own.num_nodes = 1
+        own.strategy = "ddp"  # one process holds the whole network in any case
         own.init = ""
         own.output_dir = str(Path(temporary) / "run")
         config.logs.to = []
@@ -150,8 +153,8 @@ def measure(config: RunConfig, steps: int, warmup: int = WARMUP) -> Measured:
     """
     # Each run starts afresh, and writes no checkpoint: it is ended before its last step.
     with tempfile.TemporaryDirectory(dir=Path(config.train.output_dir).parent) as folder:
-        settings = replace(config.train, output_dir=folder, max_steps=1_000_000)
-        own = replace(config, train=replace(settings, checkpoint_every=1_000_000))
+        rare = dict.fromkeys(("max_steps", "checkpoint_every", "log_every"), 1_000_000)
+        own = replace(config, train=replace(config.train, output_dir=folder, **rare))
         own.train.checkpoint_minutes = None
         on_gpu = config.train.accelerator != "cpu" and torch.cuda.is_available()
         device = torch.device("cuda" if on_gpu else "cpu")
@@ -162,7 +165,8 @@ def measure(config: RunConfig, steps: int, warmup: int = WARMUP) -> Measured:
             steps=steps,
             observed=OBSERVED if on_gpu else 0,
         )
-        with clock.attached():
+        # Not on a terminal: a bar there looks at the loss now and then, and waits for it.
+        with clock.attached(), redirect_stderr(io.StringIO()):
             train(own)
         bad = Path(folder) / "bad_steps.jsonl"
         num_bad = len(bad.read_text().splitlines()) if bad.exists() else 0
@@ -184,7 +188,7 @@ def describe(config: RunConfig, measured: Measured) -> Iterator[tuple[str, str]]
     yield "graphs/s", f"{graphs / whole:.2f}"
     yield "images/s", f"{graphs * config.data.num_views / whole:.1f}"
     flops = step_flops(config)
-    rate = matmul_rate(config.train.precision)
+    rate = _measured_rate(config)
     yield "model FLOPs of a step, counted", f"{flops / 1e12:.3f} TFLOP"
     yield f"MFU by the data sheet ({_sheet_name()})", _share(flops / whole, _sheet_rate(config))
     yield f"MFU by the matmul rate, {rate / 1e12:.3g} TFLOP/s here", _share(flops / whole, rate)
@@ -223,7 +227,7 @@ def _compare(
         for name, runs in taken.items()
     }
     first = joined[names[0]]
-    flops, rate = step_flops(config), matmul_rate(config.train.precision)
+    flops, rate = step_flops(config), _measured_rate(config)
     for name, measured in joined.items():
         whole = measured.step_seconds
         ratio = f"{whole / first.step_seconds:.2f} of {names[0]}"
@@ -251,6 +255,13 @@ def _sheet_rate(config: RunConfig) -> float | None:
     if config.train.precision != "bf16":
         return None
     return next((rate for name, rate in PEAK_BF16.items() if name in _sheet_name()), None)
+
+
+def _measured_rate(config: RunConfig) -> float:
+    """FLOP/s of a large matrix product in the precision of the run's."""
+    with true_float32(torch.device("cpu")):  # which restores what is chosen here
+        set_tf32(products=config.train.tf32, convolutions=config.train.tf32)
+        return matmul_rate(config.train.precision)
 
 
 def _share(reached: float, possible: float | None) -> str:

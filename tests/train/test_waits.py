@@ -30,11 +30,12 @@ def waits_of_a_step(shards, folder, monkeypatch, **settings):
     return Counter({place: number / 2 for place, number in clock.waits.items()})
 
 
-@pytest.mark.parametrize("accumulate", [1, 2])
+@pytest.mark.parametrize(("accumulate", "ema_decay"), [(1, "null"), (2, 0.9)])
 def test_the_host_waits_for_the_scores_of_a_batch_and_once_a_step_for_the_flag(
-    hand_shards, tmp_path, monkeypatch, accumulate
+    hand_shards, tmp_path, monkeypatch, accumulate, ema_decay
 ):
-    assert waits_of_a_step(hand_shards, tmp_path, monkeypatch, accumulate=accumulate) == {
+    settings = {"accumulate": accumulate, "ema_decay": ema_decay}
+    assert waits_of_a_step(hand_shards, tmp_path, monkeypatch, **settings) == {
         "l3r/graph/trees.py:build_tree": accumulate,
         "l3r/train/guard.py:on_before_optimizer_step": 1,
     }
