@@ -8,7 +8,8 @@ Examples::
 
   l3r sweep configs/sweep/tiny_num_layers.yaml --jobs 2
   l3r sweep configs/sweep/num_layers.yaml --list \
-      data.sources.waymo.shards=shards/waymo data.validation.waymo.shards=shards/val
+      data.sources.waymo.shards=shards/waymo \
+      data.validation.waymo.shards=shards/waymo_val
 """
 
 import argparse
