@@ -6,6 +6,9 @@ from torch import Tensor
 
 NEAR_SHARE = 0.1
 """Points nearer than this share of the median depth are dropped: x / z explodes there."""
+FOCAL_SHARE = 0.25
+"""Points whose own focal length is less than this share of the median are dropped: the sum weighs
+them by their slope, which has no bound, where those of the others are bound by the image."""
 
 
 def fit_focal(
@@ -18,7 +21,8 @@ def fit_focal(
     """Fit one focal length [px] per item: ``argmin_f sum_p w_p |u_p - f (x_p, y_p) / z_p|``.
 
     Weiszfeld: the least-squares solution is reweighted by the inverse residual, from the median
-    of the single points' ratios, so that outliers do not drag it.
+    of the single points' ratios; points far too steep for it are dropped, which would drag the sum
+    away from there, slowly, however many others agree.
 
     Args:
         pts3d_cam: Points in the frame of the camera that sees them.
@@ -41,6 +45,9 @@ def fit_focal(
     off_axis = used & (square > 1e-6)
     ratio = dot / torch.where(off_axis, square, torch.ones_like(square))
     focal = _masked_median(ratio, off_axis)
+    least = FOCAL_SHARE * focal.abs()[..., None] * torch.linalg.vector_norm(slope, dim=-1)
+    is_steep = least > torch.linalg.vector_norm(pts2d_centered, dim=-1)
+    weights = torch.where(is_steep, torch.zeros_like(weights), weights)
     for _ in range(num_iterations):
         residual = torch.linalg.vector_norm(pts2d_centered - focal[..., None, None] * slope, dim=-1)
         inverse = weights / residual.clamp_min(

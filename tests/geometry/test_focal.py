@@ -1,6 +1,6 @@
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from l3r.geometry.camera import pixel_centers
@@ -24,14 +24,17 @@ def test_exact_points_of_any_unit_give_the_exact_focal_length(seed, focal, unit)
     assert float(fit_focal(pts3d * unit, centered, weights)) == pytest.approx(focal, rel=1e-6)
 
 
-@given(SEEDS)
-def test_thirty_percent_of_outliers_near_the_camera_cost_less_than_two_percent(seed):
+@given(SEEDS, st.floats(0, 0.4))
+@example(225, 0.3)  # their sum has its least at a focal length of 4
+def test_forty_percent_of_outliers_near_the_camera_cost_nothing(seed, share):
     draw = generator(seed)
     pts3d, centered, weights = view(draw, 40.0)
-    bad = torch.rand(len(pts3d), generator=draw) < 0.3
+    bad = torch.rand(len(pts3d), generator=draw) < share
     noise = torch.randn(len(pts3d), 3, generator=draw, dtype=torch.float64)
     pts3d = torch.where(bad[:, None], noise, pts3d)
-    assert float(fit_focal(pts3d, centered, weights)) == pytest.approx(40, rel=0.02)
+    for rounds in (30, 300):
+        focal = fit_focal(pts3d, centered, weights, num_iterations=rounds)
+        assert float(focal) == pytest.approx(40, rel=1e-6)
 
 
 def test_padded_points_and_points_behind_the_camera_are_left_out():
