@@ -21,11 +21,16 @@ demo: install
 sweep-tiny: install
 	PATH="$(CURDIR)/$(BIN):$$PATH" bash demo/sweeps.sh
 
+# JOBS processes share the tests out by files. One thread each: several on too few cores wait for
+# each other far longer than they work.
+JOBS ?= 2
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+
 test: install
-	$(BIN)/python -m pytest
+	$(PYTEST) --numprocesses $(JOBS) --dist loadfile
 
 test-slow: install
-	$(BIN)/python -m pytest -m "slow and not gpu and not slurm"
+	$(PYTEST) --numprocesses $(JOBS) --dist loadfile -m "slow and not gpu and not slurm"
 
 # On a real SLURM of two nodes, which it starts and ends; docs/cluster.md says what it needs.
 test-slurm: install
