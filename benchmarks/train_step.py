@@ -14,6 +14,7 @@ image size. Medians. On a GPU times are those of the device (``benchmarks/step_c
 import argparse
 import gc
 import io
+import re
 import statistics
 import sys
 import tempfile
@@ -252,9 +253,14 @@ def _sheet_name() -> str:
 
 def _sheet_rate(config: RunConfig) -> float | None:
     """FLOP/s that the data sheet promises in the precision of the matrix products, if known."""
-    if config.train.precision != "bf16":
-        return None
-    return next((rate for name, rate in PEAK_BF16.items() if name in _sheet_name()), None)
+    return find_sheet_rate(_sheet_name()) if config.train.precision == "bf16" else None
+
+
+def find_sheet_rate(gpu: str) -> float | None:
+    """FLOP/s of dense matrix products in bfloat16, by the data sheet of a GPU, if known."""
+    # Whole words: an RTX A4000 is no A40.
+    rates = (rate for name, rate in PEAK_BF16.items() if re.search(rf"\b{name}\b", gpu))
+    return next(rates, None)
 
 
 def _measured_rate(config: RunConfig) -> float:

@@ -75,6 +75,7 @@ printf '%s %s: %s processes on %s: l3r train %s\n' "$(date '+%F %T')" "$SLURM_JO
 # A run in a container has no scontrol and makes this file, to be requeued from here. SIGTERM is for
 # the run, which saves; this shell waits for it.
 export L3R_REQUEUE_FILE=$SLURM_SUBMIT_DIR/.l3r-requeue-$SLURM_JOB_ID
+rm -f "$L3R_REQUEUE_FILE"  # that of a shell which was killed before it could obey
 trap : TERM
 code=0
 srun --kill-on-bad-exit=1 --cpus-per-task="$cpus" l3r train "${layers[@]}" || code=$?

@@ -69,7 +69,7 @@ class TrainConfig:
     """Of encoder, alignment and decoder; weights, heads, Procrustes and loss stay in float32."""
     tf32: bool = True
     """Let NVIDIA GPUs round the factors of the network's float32 products to 10 bits of mantissa;
-    Procrustes, loss and validation never do."""
+    Procrustes and loss never do, and validation computes as inference does."""
     compile: bool = False
     """Compile transformer blocks and DPT heads; the first steps take minutes, later ones less."""
     gradient_checkpointing: bool = False

@@ -12,7 +12,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from l3r.model.weight_files import AVERAGE_KEY
 from l3r.train.guard import GradientGuard
 from l3r.train.ranks import step_is_whole
-from l3r.train.sharding import gather, own_share, shard_like
+from l3r.train.sharding import collect, own_share, shard_like
 from l3r.types import Views
 
 
@@ -46,7 +46,7 @@ class WeightAverage(Callback):
     ) -> None:
         """Put the average beside the weights, under the same names."""
         keep = trainer.is_global_zero
-        average = {name: gather(value, keep=keep) for name, value in self.average.items()}
+        average = {name: collect(value, keep=keep) for name, value in self.average.items()}
         checkpoint[AVERAGE_KEY] = average
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:

@@ -113,6 +113,7 @@ class RunLog(Callback):
         self.agreement = agreement
         self.datasets = DatasetMeans(agreement)
         self.place = 0, 1
+        self.lr = 0.0
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         """Find out which of how many processes this is, before a checkpoint is taken up."""
@@ -127,6 +128,12 @@ class RunLog(Callback):
             for sink in self.sinks:
                 sink.start(trainer.global_step)
 
+    def on_train_batch_start(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Views, batch_idx: int
+    ) -> None:
+        """Note the learning rate: when the step has ended, it is that of the next one."""
+        self.lr = float(trainer.optimizers[0].param_groups[0]["lr"])
+
     def on_train_batch_end(
         self,
         trainer: L.Trainer,
@@ -140,7 +147,7 @@ class RunLog(Callback):
         step = trainer.global_step
         if not row_is_due(trainer, step, self.every) or not step_is_whole(trainer, batch_idx):
             return
-        row = {"lr": float(trainer.optimizers[0].param_groups[0]["lr"])}
+        row = {"lr": self.lr}
         own = _numbers(trainer.callback_metrics, "train/")
         parts = self.agreement.gather(own)
         row |= {name: sum(part[name] for part in parts) / len(parts) for name in own}

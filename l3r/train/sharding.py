@@ -45,7 +45,7 @@ class ShardedStrategy(DDPStrategy):
     def lightning_module_state_dict(self) -> dict[str, Any]:
         """Gather the weights on the first process; all must ask."""
         state = super().lightning_module_state_dict()
-        return {name: gather(value, keep=self.is_global_zero) for name, value in state.items()}
+        return {name: collect(value, keep=self.is_global_zero) for name, value in state.items()}
 
     def optimizer_state(self, optimizer: torch.optim.Optimizer) -> dict[str, Any]:
         """Gather the moments on the first process, laid out as the weights were; all must ask."""
@@ -80,7 +80,7 @@ class ShardedStrategy(DDPStrategy):
         self.accelerator.teardown()
 
     def _gather_moment(self, value: Tensor, parameter: nn.Parameter) -> Tensor:
-        whole = gather(value, keep=self.is_global_zero)
+        whole = collect(value, keep=self.is_global_zero)
         if whole.shape != parameter.shape:  # a count of steps, or another process keeps it
             return whole
         # Without FSDP a fused step pairs elements as they lie in memory.
@@ -134,8 +134,17 @@ def gather_network(network: Light3R) -> Light3R:
     return whole.eval()
 
 
-def gather(value: Tensor, *, keep: bool = True) -> Tensor:
+def gather(value: Tensor) -> Tensor:
     """Put a tensor together from all processes, which must all ask; others come back as they are.
+
+    Args:
+        value: Shared out or not.
+    """
+    return value.full_tensor().detach() if isinstance(value, DTensor) else value
+
+
+def collect(value: Tensor, *, keep: bool) -> Tensor:
+    """Gather a tensor for a checkpoint, on the host: all of them may not fit on one device.
 
     Args:
         value: Shared out or not.
@@ -143,8 +152,8 @@ def gather(value: Tensor, *, keep: bool = True) -> Tensor:
     """
     if not isinstance(value, DTensor):
         return value
-    whole: Tensor = value.full_tensor().detach()
-    return whole if keep else whole.new_empty(0)
+    whole = gather(value)
+    return whole.cpu() if keep else whole.new_empty(0, device="cpu")
 
 
 def shard_like(whole: Tensor, parameter: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.data_wait import measure_wait
 from benchmarks.step_clock import PARTS
-from benchmarks.train_step import describe, measure, prepared, step_flops
+from benchmarks.train_step import describe, find_sheet_rate, measure, prepared, step_flops
 from tests.train.runs import TINY
 
 ROOT = Path(__file__).parents[2]
@@ -73,3 +73,20 @@ def test_the_wait_for_data_is_that_of_a_real_run():
     with prepared(TINY) as config:
         shares = measure_wait(config, 30)
     assert all(0 < share < 1 for share in shares)
+
+
+@pytest.mark.parametrize(
+    ("name", "rate"),
+    [
+        ("NVIDIA H200", 989e12),
+        ("NVIDIA H100 80GB HBM3", 989e12),
+        ("NVIDIA H100 PCIe", 756e12),
+        ("NVIDIA A100-SXM4-80GB", 312e12),
+        ("NVIDIA A40", 150e12),
+        ("NVIDIA RTX A4000", None),
+        ("NVIDIA A100X", None),
+        ("CPU", None),
+    ],
+)
+def test_a_data_sheet_is_that_of_the_very_gpu(name, rate):
+    assert find_sheet_rate(name) == rate

@@ -11,7 +11,8 @@ TOOLS = {
     # Tasks of a job step that is no training run here; training is printed.
     "srun": 'case " $* " in *" l3r train "*) printf "%s\\n" "$MASTER_ADDR" "$@"; exit;; esac\n'
     'while [ "$1" != bash ]; do shift; done\nexec "$@"\n',
-    "scontrol": '[ "$*" = "show hostnames n[4-5]" ] && printf "n4\\nn5\\n"\n',
+    "scontrol": '[ "$*" = "show hostnames n[4-5]" ] && printf "n4\\nn5\\n" && exit\n'
+    'echo "$*" >&2; exit 1\n',
 }
 
 
@@ -91,6 +92,14 @@ def test_a_copy_that_fails_starts_no_training(run_job, shards, tmp_path):
     done = run_job(f"data.sources.room.shards={shards}", L3R_STAGE_DIR=stage)
     assert done.returncode != 0
     assert "l3r" not in done.stdout
+
+
+def test_what_a_killed_job_asked_for_does_not_requeue_a_later_one(run_job, tmp_path):
+    left = tmp_path / ".l3r-requeue-7"
+    left.touch()
+    done = run_job("a.yaml")
+    assert (done.returncode, done.stderr.count("requeue")) == (0, 0)
+    assert not left.exists()
 
 
 @pytest.mark.parametrize(("args", "job"), [(("a.yaml",), ""), ((), "7")], ids=["no job", "nothing"])

@@ -1,4 +1,5 @@
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -7,6 +8,8 @@ from hypothesis import strategies as st
 
 from l3r.config import load_config
 from l3r.train.optim import build_optimizer, build_schedule, lr_factor
+from l3r.train.run import train
+from tests.train.runs import layers, read_log
 
 
 def test_rate_scales_with_images_and_small_parameters_do_not_decay():
@@ -56,3 +59,16 @@ def test_the_schedule_sets_the_rate_of_each_step():
     optimizer.step()
     schedule.step()
     assert optimizer.param_groups[0]["lr"] == pytest.approx(1e-2)
+
+
+@pytest.mark.parametrize("accumulate", [1, 2])
+def test_the_log_has_the_rate_that_a_step_was_taken_at(
+    hand_shards, tmp_path, monkeypatch, accumulate
+):
+    monkeypatch.chdir(Path(__file__).parents[2])
+    settings = {"max_steps": 3, "warmup_steps": 2, "accumulate": accumulate}
+    config = load_config(layers(hand_shards, tmp_path, **settings))
+    train(config)
+    full = config.train.lr * 2 * 3 / 64
+    expected = [full * lr_factor(step, config) for step in range(3)]
+    assert [float(row["lr"]) for row in read_log(tmp_path)] == pytest.approx(expected)

@@ -6,13 +6,17 @@ from pathlib import Path
 import pytest
 import torch
 import torch.distributed as dist
+from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.distributed.device_mesh import init_device_mesh
+from torch.distributed.tensor import DTensor, Shard
+from torch.testing._internal.distributed.fake_pg import FakeStore
 
 from l3r.config import load_config
 from l3r.errors import ConfigError
 from l3r.inference.checkpoint import build_untrained, read_checkpoint
 from l3r.train.optim import build_optimizer
 from l3r.train.sharding import (
+    collect,
     gather,
     gather_network,
     own_share,
@@ -145,7 +149,7 @@ def test_a_network_is_shared_out_and_gathered_again(mesh):
         assert torch.equal(gathered.state_dict()[name], value)
         shared = network.state_dict()[name]
         assert torch.equal(gather(shard_like(value, shared)), value)
-        assert gather(shared, keep=False).numel() == 0
+        assert collect(shared, keep=False).numel() == 0
         assert own_share(shared).data_ptr() == own_share(network.get_parameter(name)).data_ptr()
     image, shape = torch.rand(1, 3, 3, 32, 32), torch.full((1, 3, 2), 32)
     prediction, expected = network.train()(image, shape), whole.train()(image, shape)
@@ -157,3 +161,19 @@ def test_a_network_is_shared_out_and_gathered_again(mesh):
     ]
     torch.testing.assert_close(*norms)
     assert len(build_optimizer(network, config).param_groups[0]["params"])
+
+
+@pytest.mark.parametrize("keep", [True, False])
+def test_a_checkpoint_is_put_together_on_the_host_not_on_one_device(keep):
+    # Two GPUs that only pretend, of which this process has the first.
+    dist.init_process_group("fake", store=FakeStore(), rank=0, world_size=2)
+    try:
+        gpus = init_device_mesh("cuda", (2,))
+        with FakeTensorMode():
+            share = torch.empty(3, 4, device="cuda:0")
+            shared = DTensor.from_local(share, gpus, [Shard(0)], run_check=False)
+            assert gather(shared).device.type == "cuda"
+            whole = collect(shared, keep=keep)
+    finally:
+        dist.destroy_process_group()
+    assert (whole.device.type, tuple(whole.shape)) == ("cpu", (6, 4) if keep else (0,))
