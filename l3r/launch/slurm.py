@@ -8,6 +8,7 @@ from pathlib import Path
 from l3r.errors import LaunchError
 from l3r.launch.expand import Sweep
 from l3r.launch.run_state import RunState
+from l3r.train.signals import name_job
 
 SCRIPT = Path("slurm/sweep.sh")
 
@@ -44,16 +45,16 @@ def submit_sweep(sweep: Sweep, states: Mapping[str, RunState]) -> str:
     except OSError as error:
         raise LaunchError(f"sbatch: {error.strerror}; run this where jobs are submitted") from error
     if done.returncode:
-        raise LaunchError(f"sbatch refuses the job: {done.stderr.strip().splitlines()[-1]}")
+        said = done.stderr.strip() or f"exit code {done.returncode}"
+        raise LaunchError(f"sbatch refuses the job: {said.splitlines()[-1]}")
     return f"{done.stdout.strip()}: {len(left)} tasks, a run each"
 
 
 def job_is_leaving() -> bool:
     """Tell whether this process is part of a SLURM job that no longer runs: requeued, cancelled."""
-    job = os.environ.get("SLURM_JOB_ID")
-    if job is None:
+    if "SLURM_JOB_ID" not in os.environ:
         return False
-    command = ["squeue", "--noheader", f"--jobs={job}", "--format=%T"]
+    command = ["squeue", "--noheader", f"--jobs={name_job()}", "--format=%T"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     except (OSError, subprocess.TimeoutExpired):

@@ -56,6 +56,16 @@ class StopSignals:
         self._seen.add(number)
 
 
+def name_job() -> str:
+    """Name the SLURM job that this process is part of, of an array this task alone.
+
+    The ID of one task of an array is that of the whole array as well.
+    """
+    if "SLURM_ARRAY_JOB_ID" in os.environ:
+        return f"{os.environ['SLURM_ARRAY_JOB_ID']}_{os.environ['SLURM_ARRAY_TASK_ID']}"
+    return os.environ["SLURM_JOB_ID"]
+
+
 def requeue_job() -> str:
     """Send this SLURM job back to the queue.
 
@@ -65,9 +75,7 @@ def requeue_job() -> str:
     Returns:
         What happened, as the end of a sentence.
     """
-    job = os.environ["SLURM_JOB_ID"]
-    if "SLURM_ARRAY_JOB_ID" in os.environ:
-        job = f"{os.environ['SLURM_ARRAY_JOB_ID']}_{os.environ['SLURM_ARRAY_TASK_ID']}"
+    job = name_job()
     request = os.environ.get("L3R_REQUEUE_FILE")
     try:
         if request and shutil.which("scontrol") is None:

@@ -13,7 +13,7 @@ from l3r.launch.expand import expand
 from l3r.launch.measure import main as measure
 from l3r.launch.measure import measure_rows
 from l3r.launch.run_state import read_states, scoring_request
-from l3r.launch.slurm import submit_sweep
+from l3r.launch.slurm import job_is_leaving, submit_sweep
 from tests.launch.sweeps import score_by_hand, train_by_hand, write_sweep_file
 from tests.slurm.cluster import ROOT
 
@@ -112,6 +112,23 @@ def test_what_cannot_be_submitted_says_why(sweep, tools, monkeypatch):
     monkeypatch.setenv("PATH", f"{tools}:/usr/bin:/bin")
     with pytest.raises(LaunchError, match="refuses the job: sbatch: error: no such partition"):
         submit_sweep(sweep, states)
+    (tools / "sbatch").write_text("#!/bin/sh\nexit 3\n")
+    with pytest.raises(LaunchError, match="refuses the job: exit code 3"):
+        submit_sweep(sweep, states)
+
+
+def test_a_task_that_shares_its_id_with_its_array_asks_for_itself_alone(tools, monkeypatch):
+    squeue = tools / "squeue"
+    squeue.write_text(
+        '#!/bin/sh\ncase "$*" in *--jobs=7_2*) echo RUNNING;; *) echo PENDING; echo RUNNING;; esac\n'
+    )
+    squeue.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tools}:/usr/bin:/bin")
+    for name, value in {"JOB_ID": "7", "ARRAY_JOB_ID": "7", "ARRAY_TASK_ID": "2"}.items():
+        monkeypatch.setenv(f"SLURM_{name}", value)
+    assert not job_is_leaving()
+    monkeypatch.setenv("SLURM_ARRAY_TASK_ID", "1")
+    assert job_is_leaving()
 
 
 def test_rows_that_were_never_measured_are_rehearsed(sweep, tools, monkeypatch):
