@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from l3r.config.check import require
 from l3r.errors import LaunchError
 from l3r.files import write_atomic
 from l3r.launch.expand import Run, Sweep
@@ -23,6 +24,7 @@ from l3r.train.signals import requeue_job
 
 _POLL_SECONDS = 0.2
 _TAIL = 4096
+_LEAVING = "this job goes back to the queue, and goes on from there later"
 _L3R = (sys.executable, "-m", "l3r")
 Stage = Literal["train", "score"]
 
@@ -45,9 +47,13 @@ class SweepRunner:
         sweep: The sweep.
         jobs: Runs at a time; they share the cores unless OMP_NUM_THREADS says how many each takes.
         launcher: Words before ``l3r train``, such as those of srun.
+
+    Raises:
+        ConfigError: Fewer than one run at a time.
     """
 
     def __init__(self, sweep: Sweep, *, jobs: int = 1, launcher: Sequence[str] = ()) -> None:
+        require(jobs >= 1, "--jobs", jobs, "1 or more")
         self.sweep = sweep
         self.jobs = jobs
         self.launcher = tuple(launcher)
@@ -55,6 +61,7 @@ class SweepRunner:
         self.progress = SweepProgress()
         self.active: list[_Active] = []
         self.is_to_requeue = False
+        self.is_asked = False
 
     def run(self, runs: Sequence[Run]) -> list[str]:
         """Do the runs that are not over; those that others are at are left to them.
@@ -75,7 +82,7 @@ class SweepRunner:
                     while waiting and len(self.active) < self.jobs:
                         self._begin(waiting.popleft())
                     self._look()
-                    if self.is_to_requeue:
+                    if self.is_to_requeue and not self.is_asked:
                         self._requeue()
             except BaseException:
                 self._stop()
@@ -132,12 +139,16 @@ class SweepRunner:
 
     def _settle(self, active: _Active, code: int) -> None:
         run = active.run
+        if self.is_to_requeue:
+            # It has requeued the job itself, but for one that was at its start or at its end.
+            active.lock.release()
+            raise LaunchError(_LEAVING if job_is_leaving() else requeue_job())
         if code == 0 and active.stage == "train":
             self.active.append(self._start(run, "score", active.lock, active.began))
             return
         if code and job_is_leaving():
             active.lock.release()
-            raise LaunchError("this job goes back to the queue, and goes on from there later")
+            raise LaunchError(_LEAVING)
         if code and self._state(run).kind not in OVER:
             write_atomic(run.folder / FAILURE, explain_exit(code, run.folder / LOG) + "\n")
         active.lock.release()
@@ -166,7 +177,7 @@ class SweepRunner:
 
     def _requeue(self) -> None:
         """Let a training save and requeue the job; where there is none, nothing is to be saved."""
-        self.is_to_requeue = False
+        self.is_asked = True
         trainings = [active for active in self.active if active.stage == "train"]
         for active in trainings:
             active.process.send_signal(signal.SIGUSR1)

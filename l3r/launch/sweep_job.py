@@ -41,6 +41,7 @@ def run_share(
     Returns:
         The table, and the names of runs that failed.
     """
+    runner = SweepRunner(sweep, jobs=jobs, launcher=launcher)
     write_sweep(sweep)
-    failed = SweepRunner(sweep, jobs=jobs, launcher=launcher).run(share)
+    failed = runner.run(share)
     return report_sweep(sweep.out), failed

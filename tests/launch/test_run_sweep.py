@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from l3r.cli.main import main
 from l3r.errors import LaunchError
 from l3r.launch import run_sweep
 from l3r.launch.expand import expand
@@ -118,6 +119,34 @@ def test_a_job_that_goes_back_to_the_queue_marks_no_run_as_failed(two, tmp_path,
         SweepRunner(two).run(two.runs)
     assert kinds(two)[0] == "begun"
     assert calls(two) == ["train none/seed_0"]
+
+
+def test_a_job_near_its_end_is_requeued_though_the_training_was_still_at_its_start(
+    two, tmp_path, monkeypatch
+):
+    (two.out / "none-0.txt").write_text("wait")  # it knows nothing of SIGUSR1 and dies of it
+    for name, says in {"squeue": "echo RUNNING", "scontrol": f'echo "$*" >> {tmp_path}/said'}.items():
+        (tmp_path / name).write_text(f"#!/bin/sh\n{says}\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.setenv("SLURM_JOB_ID", "7")
+
+    def near_the_end():
+        while not (two.out / "waiting").exists():
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGUSR1)
+
+    threading.Thread(target=near_the_end).start()
+    with pytest.raises(LaunchError, match="job 7 is requeued"):
+        SweepRunner(two).run(two.runs)
+    assert (tmp_path / "said").read_text() == "requeue 7\n"
+    assert kinds(two) == ["begun", "new", "new", "new"]
+
+
+def test_no_run_at_a_time_is_refused_before_anything_is_written(tmp_path, capsys):
+    assert main(["sweep", str(write_sweep_file(tmp_path)), "--jobs", "0"]) == 2
+    assert "--jobs is 0, expected 1 or more" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
