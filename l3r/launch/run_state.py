@@ -78,7 +78,8 @@ def read_state(run: Run, request: Mapping[str, Any]) -> RunState:
         if _EXPLODED in said:
             return replace(state, kind="diverged", detail=said)
         return replace(state, kind="failed", detail=f"{said}; see {run.folder / LOG}")
-    if state.kind != "trained":
+    is_at_end = state.kind == "begun" and state.step == state.max_steps
+    if state.kind not in ("trained", "waiting") and not is_at_end:
         return state
     scores = read_scores(run, request)
     if scores is None:
@@ -105,11 +106,15 @@ def scoring_request(sweep: Sweep) -> dict[str, Any]:
 
 
 def read_scores(run: Run, request: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Read ``scores.json``; None where there is none of this request and this checkpoint."""
+    """Read ``scores.json``; None where there is none of this request and this checkpoint.
+
+    Scores outlive a checkpoint that was removed, or is named from another folder.
+    """
     path = run.folder / "scores.json"
     try:
         scores = dict(json.loads(path.read_text()))
-        is_stale = path.stat().st_mtime < run.checkpoint.stat().st_mtime
+        has_weights = run.checkpoint.is_file()
+        is_stale = has_weights and path.stat().st_mtime < run.checkpoint.stat().st_mtime
     except (OSError, ValueError, TypeError):
         return None
     wanted = {**request, "settings": _settings_of(run)}
@@ -181,7 +186,8 @@ def _require_same(path: Path, found: RunConfig, wanted: RunConfig) -> None:
     from l3r.train.checkpointing import may_change
 
     for key, (old, new) in changes.items():
-        if not may_change(key, wanted):
+        # A run that is resumed does not read it again; a run of a sweep is told by it.
+        if key == "train.init" or not may_change(key, wanted):
             raise ConfigError(
                 f"{path}: made with {key}={old}, this sweep has {new}; give --out or output_dir "
                 "for the runs of this one"

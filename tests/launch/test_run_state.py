@@ -39,6 +39,26 @@ def test_scores_of_other_graphs_or_older_weights_do_not_count(sweep, state):
     assert state().kind == "trained"
 
 
+def test_scores_outlive_the_checkpoint_and_a_training_that_was_cut_short_does_not(sweep, state):
+    run = sweep.runs[0]
+    train_by_hand(run)
+    score_by_hand(run, scoring_request(sweep))
+    run.checkpoint.unlink()
+    assert state().kind == "scored"
+    train_by_hand(run, steps=50)
+    assert state().kind == "begun"
+
+
+def test_a_finished_run_with_another_start_is_not_taken_for_this_one(tmp_path):
+    rows = {"scratch": [], "start": "train.init=weights/start"}
+    sweep = expand(write_sweep_file(tmp_path, rows=rows))
+    train_by_hand(sweep.runs[1])
+    rows = {"scratch": [], "start": "train.init=weights/other"}
+    other = expand(write_sweep_file(tmp_path, rows=rows))
+    with pytest.raises(ConfigError, match=r"train\.init=weights/start, this sweep has weights/oth"):
+        read_states(other)
+
+
 def test_a_run_that_gave_up_is_diverged_and_one_that_went_on_is_not(sweep, state):
     run = sweep.runs[0]
     train_by_hand(run, steps=40)
@@ -95,6 +115,9 @@ def test_a_sweep_over_checkpoints_waits_for_them_and_scores_each_row_anew(tmp_pa
     }
     score_by_hand(sweep.runs[0], scoring_request(sweep))
     assert read_states(sweep)["mst/seed_0"].kind == "scored"
+    (tmp_path / "seed_0.ckpt").rename(tmp_path / "kept")
+    assert read_states(sweep)["mst/seed_0"].kind == "scored", "as seen from another folder"
+    (tmp_path / "kept").rename(tmp_path / "seed_0.ckpt")
     other = {**rows, "mst": ["graph.algorithm=mst", "graph.knn=3"]}
     path = write_sweep_file(tmp_path, base=[], rows=other, checkpoint=str(checkpoint))
     assert read_states(expand(path))["mst/seed_0"].kind == "trained"
