@@ -21,6 +21,10 @@ class GeometryError(L3RError):
     """Points or cameras that admit no solution."""
 
 
+class NotFiniteError(GeometryError):
+    """Numbers of a network that are not finite: its weights are broken, or training diverged."""
+
+
 class CheckpointError(L3RError):
     """A checkpoint that cannot be read or does not fit."""
 

@@ -27,7 +27,7 @@ class RunFolder:
     training: Table
     validation: Table
     bad_steps: list[dict[str, Any]]
-    """Rows of ``bad_steps.jsonl``."""
+    """Rows of ``bad_steps.jsonl``; ``problem`` says why one ended the run, empty: it did not."""
     machine: dict[str, Any]
     """Content of ``machine.json``."""
     pictures: list[Path]
@@ -107,7 +107,8 @@ def _read_bad_steps(path: Path, problems: list[str]) -> list[dict[str, Any]]:
     for line in path.read_text(errors="replace").splitlines():
         try:
             row = json.loads(line)
-            rows.append({name: row[name] for name in ("step", "loss", "grad_norm", "keys")})
+            found = {name: row[name] for name in ("step", "loss", "grad_norm", "keys")}
+            rows.append({**found, "problem": row.get("problem", "")})
         except (json.JSONDecodeError, KeyError, TypeError):
             problems.append(f"{path.name}: a damaged line left out")
     return rows

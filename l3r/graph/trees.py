@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from l3r.config import GraphConfig
-from l3r.errors import GeometryError
+from l3r.errors import GeometryError, NotFiniteError
 from l3r.graph.edge_costs import edge_costs
 from l3r.types import SceneTree
 
@@ -25,14 +25,17 @@ def build_tree(scores: Float[Tensor, "b n n"], config: GraphConfig) -> SceneTree
         config: ``algorithm``, ``cost``, ``cost_power`` and ``knn``.
 
     Raises:
-        GeometryError: Fewer than two views, or a score that is not finite.
+        GeometryError: Fewer than two views.
+        NotFiniteError: A score is not finite.
     """
     similarity = scores.detach().cpu().double().numpy()
     num_views = similarity.shape[-1]
     if num_views < 2:
         raise GeometryError(f"a tree over {num_views} view: expected 2 or more; add images")
     if not np.isfinite(similarity).all():
-        raise GeometryError("similarity scores are not finite; the encoder's weights may be broken")
+        raise NotFiniteError(
+            "similarity scores are not finite; the encoder's weights may be broken"
+        )
     costs = edge_costs(similarity, config)
     if config.knn:
         costs = sparsify(costs, config.knn)

@@ -22,8 +22,6 @@ FAILURE = "failure.txt"
 """File in a run's folder that says why a process of it failed."""
 LOG = "log.txt"
 """File with what a run's processes said."""
-_EXPLODED = "similarity scores are not finite"
-"""What a training ends with whose weights left the finite in between two steps."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,8 +73,6 @@ def read_state(run: Run, request: Mapping[str, Any]) -> RunState:
     failure = run.folder / FAILURE
     if state.kind in ("new", "begun", "trained") and failure.is_file():
         said = failure.read_text().strip()
-        if _EXPLODED in said:
-            return replace(state, kind="diverged", detail=said)
         return replace(state, kind="failed", detail=f"{said}; see {run.folder / LOG}")
     is_at_end = state.kind == "begun" and state.step == state.max_steps
     if state.kind not in ("trained", "waiting") and not is_at_end:
@@ -166,10 +162,12 @@ def _last_bad_step(folder: RunFolder, max_bad_steps: int) -> str:
     """Say where a run was given up; empty where it was not."""
     rows = folder.bad_steps[-max_bad_steps:]
     steps = [int(row["step"]) for row in rows]
-    first = steps[0] if steps else 0
     logged = folder.training["step"]
-    went_on = len(logged) and steps and logged[-1] > steps[-1] + 1
-    if went_on or steps != list(range(first, first + max_bad_steps)):
+    if not steps or (len(logged) and logged[-1] > steps[-1] + 1):
+        return ""
+    if rows[-1]["problem"]:
+        return f"step {steps[-1]}: {rows[-1]['problem']}"
+    if steps != list(range(steps[0], steps[0] + max_bad_steps)):
         return ""
     return (
         f"{max_bad_steps} steps in a row were not finite, the last one {steps[-1]} (loss "

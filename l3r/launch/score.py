@@ -8,7 +8,7 @@ import torch
 
 from l3r.config import RunConfig, SourceConfig, override_config
 from l3r.data.source import ShardFolder, open_store
-from l3r.errors import ConfigError
+from l3r.errors import ConfigError, NotFiniteError
 from l3r.eval.graphs import GraphScores, evaluate_opened
 from l3r.files import write_atomic
 from l3r.inference.checkpoint import load_model_and_config
@@ -53,8 +53,11 @@ def score_run(sweep: Sweep, run: Run) -> dict[str, Any]:
     if not _is_finite(model):
         content["problem"] = "weights are not finite"
     else:
-        # Shards may have moved since the training.
-        content |= _score_sources(sweep, model, config, run.config or config)
+        try:
+            # Shards may have moved since the training.
+            content |= _score_sources(sweep, model, config, run.config or config)
+        except NotFiniteError as error:
+            content["problem"] = str(error)
     run.folder.mkdir(parents=True, exist_ok=True)
     write_atomic(run.folder / "scores.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
     return content

@@ -12,7 +12,7 @@ from lightning.pytorch.callbacks import Callback
 from torch import Tensor, nn
 
 from l3r.config import RunConfig
-from l3r.errors import LaunchError
+from l3r.errors import LaunchError, NotFiniteError
 from l3r.files import append_whole, write_atomic
 from l3r.loss.joint import LossTerms
 from l3r.train.csv_table import bear_loss_of
@@ -69,7 +69,8 @@ class GradientGuard(Callback):
     """Skips a step whose loss or gradient is not finite, on all processes alike.
 
     The keys of the step's graphs, those of all processes, are added to ``bad_steps.jsonl``. Also
-    measures the gradient's norm, as ``train/grad_norm``. Stands behind :class:`StepMean`. A resumed
+    measures the gradient's norm, as ``train/grad_norm``. A step in which the network has no finite
+    numbers at all ends the run, and its row says so as ``problem``. Stands behind :class:`StepMean`. A resumed
     run goes on counting, and drops the rows after its checkpoint first.
 
     Args:
@@ -116,9 +117,17 @@ class GradientGuard(Callback):
         step = trainer.global_step + 1
         row = {"step": step, "loss": str(float(loss)), "grad_norm": str(float(norm))}
         if trainer.is_global_zero:
-            with bear_loss_of(f"the row of bad step {step}"):
-                append_whole(self.path, json.dumps({**row, "keys": keys}) + "\n")
+            self._write({**row, "keys": keys})
         self._count(row)
+
+    def on_exception(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException
+    ) -> None:
+        """Write down a step that could not be finished, as weights left the finite before it."""
+        if isinstance(exception, NotFiniteError):
+            row = {"step": trainer.global_step + 1, "loss": "nan", "grad_norm": "nan"}
+            # Each process its own graphs: others may never come to know of it.
+            self._write({**row, "keys": self.keys, "problem": str(exception)})
 
     def state_dict(self) -> dict[str, Any]:
         """Give what a checkpoint keeps; it is the same in all processes."""
@@ -127,6 +136,10 @@ class GradientGuard(Callback):
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Go on counting."""
         self.bad_in_a_row = int(state_dict["bad_in_a_row"])
+
+    def _write(self, row: dict[str, Any]) -> None:
+        with bear_loss_of(f"the row of bad step {row['step']}"):
+            append_whole(self.path, json.dumps(row) + "\n")
 
     def _count(self, row: dict[str, Any]) -> None:
         self.bad_in_a_row += 1

@@ -39,7 +39,7 @@ def main(words):
         sys.stderr.write("out of luck\n")
         return 1
     if what == "explode":
-        sys.stderr.write("l3r train: similarity scores are not finite\nsrun: error: task 0\n")
+        note_bad_steps(run, [8], problem="scores are not finite")
         return 2
     if what == "diverge":
         note_bad_steps(run, [7, 8, 9])

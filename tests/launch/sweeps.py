@@ -53,7 +53,7 @@ def score_by_hand(run, request, *, problem="", graphs="a" * 64, **network):
     (run.folder / "scores.json").write_text(json.dumps(content))
 
 
-def note_bad_steps(run, steps):
-    rows = [{"step": n, "loss": "nan", "grad_norm": "inf", "keys": ["x"]} for n in steps]
+def note_bad_steps(run, steps, **more):
+    rows = [{"step": n, "loss": "nan", "grad_norm": "inf", "keys": ["x"], **more} for n in steps]
     text = "".join(json.dumps(row) + "\n" for row in rows)
     (run.folder / "bad_steps.jsonl").write_text(text)

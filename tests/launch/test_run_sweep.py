@@ -76,7 +76,7 @@ def test_a_run_whose_weights_explode_between_two_steps_is_diverged(two):
     (two.out / "none-0.txt").write_text("explode")
     assert SweepRunner(two).run(two.runs[:1]) == []
     assert read_states(two)["none/seed_0"].describe() == (
-        "diverged: exit code 2: l3r train: similarity scores are not finite"
+        "diverged: step 8: scores are not finite"
     )
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from l3r.config import load_config
-from l3r.errors import LaunchError
+from l3r.errors import LaunchError, NotFiniteError
 from l3r.train.module import TrainModule
 from l3r.train.run import train
 from tests.train.runs import layers, losses, read_log
@@ -36,6 +36,14 @@ def spoil(monkeypatch):
         monkeypatch.setattr(TrainModule, "training_step", training_step)
 
     return install
+
+
+def test_weights_that_leave_the_finite_in_one_update_are_written_down(hand_shards, tmp_path):
+    with pytest.raises(NotFiniteError, match="similarity scores"):
+        run(hand_shards, tmp_path, lr=1e30)
+    row = json.loads((tmp_path / "bad_steps.jsonl").read_text().splitlines()[-1])
+    assert row["problem"].startswith("similarity scores are not finite")
+    assert row["keys"]
 
 
 def listed(folder):
