@@ -7,7 +7,7 @@ from typing import Any, TypeVar, cast
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
+from yaml import MarkedYAMLError, YAMLError
 
 from l3r.config.run import RunConfig
 from l3r.errors import ConfigError
@@ -145,4 +145,6 @@ def _to_object(config: DictConfig, where: str) -> object:
 
 def _first_line(error: Exception) -> str:
     """Keep what a user needs of a library's many-line message."""
+    if isinstance(error, MarkedYAMLError) and error.problem_mark:
+        return f"line {error.problem_mark.line + 1}: {error.problem}"
     return " ".join(str(error).split(" full_key:")[0].split("\n")[0].split())

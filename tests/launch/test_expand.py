@@ -131,6 +131,14 @@ def test_a_bad_sweep_gets_one_line_that_says_what_to_do(tmp_path, content, messa
     assert not (tmp_path / "out").exists()
 
 
+def test_two_rows_of_one_name_are_refused_by_that_name(tmp_path, capsys):
+    path = tmp_path / "twice.yaml"
+    path.write_text("rows:\n  a: []\n  a: loss.alpha=1\n")
+    assert main(["sweep", str(path), "--list"]) == 2
+    expected = f"l3r sweep: layer {path}: line 3: found duplicate key a\n"
+    assert capsys.readouterr().err == expected
+
+
 @pytest.mark.parametrize("layer", ["train.seed=3", "train.output_dir=x"])
 def test_the_command_line_cannot_set_what_the_sweep_sets(tmp_path, layer):
     with pytest.raises(ConfigError, match="the sweep sets it"):
