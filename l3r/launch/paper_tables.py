@@ -30,7 +30,7 @@ class PaperTable:
 
 _ONE_RUN = (
     "The rows L = 4, lambda = 0.1 and DUSt3R of the paper's three ablation tables are one training"
-    " (35.7 / 36.9 / 0.032); here each sweep trains its own."
+    " (35.7 / 36.9 / 0.032)."
 )
 _MAIN_MODEL = (
     "The last row is the paper's main model at 512, the row of 200 views in its main table"

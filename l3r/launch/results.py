@@ -94,7 +94,7 @@ def collect_results(sweep: Sweep, states: Mapping[str, RunState]) -> SweepResult
         paper=paper,
         rows=rows,
         scored_on=_scored_on(states.values()),
-        notes=_notes(paper, states.values()),
+        notes=[*_notes(paper, states.values()), *_twins(sweep, states)],
         problems=[
             f"{name} {state.describe()}"
             for name, state in states.items()
@@ -198,6 +198,19 @@ def _notes(paper: PaperTable | None, states: Collection[RunState]) -> list[str]:
             f"count as failed; all cameras at one place would score {shown}."
         )
     return [*notes, *(paper.notes if paper else ())]
+
+
+def _twins(sweep: Sweep, states: Mapping[str, RunState]) -> list[str]:
+    """Name the rows that another sweep has trained."""
+    labels = {
+        "/".join(twin.parts[-3:-1]): run.row
+        for run in sweep.runs
+        if (twin := states[run.name].twin)
+    }
+    return [
+        f"Row {row} was trained as {twin}, with the same configuration and seeds."
+        for twin, row in labels.items()
+    ]
 
 
 def format_score(value: float | None, metric: str) -> str:

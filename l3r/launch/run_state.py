@@ -13,6 +13,7 @@ from l3r.errors import ConfigError
 from l3r.export.run_folder import RunFolder, read_run_folder
 from l3r.export.run_report import recent_rate
 from l3r.launch.expand import Run, Sweep
+from l3r.launch.twins import find_twins, read_twin
 
 Kind = Literal["new", "waiting", "begun", "trained", "scored", "diverged", "failed"]
 """``waiting``: for a checkpoint that others make. ``begun``: under way, or to be gone on with."""
@@ -43,9 +44,16 @@ class RunState:
     """Peak memory on a GPU."""
     num_devices: int | None = None
     """GPUs that it was last trained on; None on a CPU, or where it never began."""
+    twin: Path | None = None
+    """Folder of the same training in a neighbouring sweep, that it was or will be taken from."""
 
     def describe(self) -> str:
         """Say it in a few words."""
+        if self.twin is None:
+            return self._describe()
+        return f"{self._describe()}, of {'/'.join(self.twin.parts[-3:-1])}"
+
+    def _describe(self) -> str:
         of = f"step {self.step:,} of {self.max_steps:,}" if self.max_steps is not None else ""
         match self.kind:
             case "begun":
@@ -132,11 +140,15 @@ def _trained_state(run: Run) -> RunState:
     assert run.config is not None
     state = RunState(kind="new", max_steps=run.config.train.max_steps)
     if not (run.folder / "config.yaml").is_file():
+        for twin in find_twins(run):
+            found = _trained_state(replace(run, folder=twin))
+            if found.kind == "trained":
+                return replace(found, twin=twin)
         return state
     folder = read_run_folder(run.folder)
     if folder.config is not None:
         _require_same(run.folder / "config.yaml", folder.config, run.config)
-    state = replace(state, **_measured(folder, run.config))
+    state = replace(state, **_measured(folder, run.config), twin=read_twin(run))
     if bad := _last_bad_step(folder, run.config.train.max_bad_steps):
         return replace(state, kind="diverged", detail=bad)
     if folder.is_complete and state.step >= run.config.train.max_steps:

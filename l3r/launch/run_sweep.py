@@ -20,6 +20,7 @@ from l3r.launch.run_lock import RunLock
 from l3r.launch.run_state import FAILURE, LOG, OVER, RunState, read_state, scoring_request
 from l3r.launch.slurm import job_is_leaving
 from l3r.launch.sweep_progress import SweepProgress
+from l3r.launch.twins import adopt_twin
 from l3r.train.signals import requeue_job
 
 _POLL_SECONDS = 0.2
@@ -100,7 +101,15 @@ class SweepRunner:
             return
         (run.folder / FAILURE).unlink(missing_ok=True)
         # Without the note of a failure it may turn out to be trained.
-        stage: Stage = "score" if self._state(run).kind == "trained" else "train"
+        state = self._state(run)
+        if state.twin is not None and not (run.folder / "config.yaml").is_file():
+            adopt_twin(run, state.twin)
+            state = self._state(run)
+        if state.kind in OVER:
+            lock.release()
+            self.progress.end(run, state.describe())
+            return
+        stage: Stage = "score" if state.kind == "trained" else "train"
         self.active.append(self._start(run, stage, lock, time.monotonic()))
 
     def _start(self, run: Run, stage: Stage, lock: RunLock, began: float) -> _Active:

@@ -70,8 +70,9 @@ class GradientGuard(Callback):
 
     The keys of the step's graphs, those of all processes, are added to ``bad_steps.jsonl``. Also
     measures the gradient's norm, as ``train/grad_norm``. A step in which the network has no finite
-    numbers at all ends the run, and its row says so as ``problem``. Stands behind :class:`StepMean`. A resumed
-    run goes on counting, and drops the rows after its checkpoint first.
+    numbers at all ends the run, and its row says so as ``problem``. Stands behind
+    :class:`StepMean`. A resumed run goes on counting, and drops the rows after its checkpoint
+    first.
 
     Args:
         path: Where bad steps are written down.

@@ -5,6 +5,7 @@ import json
 import yaml
 
 from l3r.config import to_yaml
+from l3r.version import __version__
 
 BASE = ["data.sources.hand.shards=shards", "data.validation.hand.shards=shards"]
 NETWORK = {"rra_5": 40.0, "rta_5": 30.0, "ate": 0.05, "rra_15": 80.0, "rta_15": 70.0}
@@ -33,7 +34,7 @@ def train_by_hand(run, *, steps=None, rate=16.0, machine="CPU", done=True):
     rows = [f"{step},{1 / step},{rate},3.5" for step in (1, last) if step]
     header = "step,loss,graphs_per_second,gpu_gib\n"
     (run.folder / "metrics.csv").write_text(header + "\n".join(rows) + "\n")
-    facts = {"device": machine, "processes": 8}
+    facts = {"device": machine, "processes": 8, "light3r": __version__}
     (run.folder / "machine.json").write_text(json.dumps(facts))
     if done and steps is None:
         (run.folder / "model.ckpt").write_bytes(b"weights")

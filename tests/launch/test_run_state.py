@@ -98,7 +98,7 @@ def test_a_longer_training_goes_on_and_another_one_is_refused(sweep, tmp_path):
     ):
         read_states(other)
     assert {
-        state.kind for state in read_states(expand(sweep.file, out=tmp_path / "b")).values()
+        state.kind for state in read_states(expand(sweep.file, out=tmp_path / "b" / "c")).values()
     } == {"new"}
 
 

@@ -75,9 +75,7 @@ def test_a_run_that_dies_or_diverges_ends_no_other_and_only_the_dead_is_tried_ag
 def test_a_run_whose_weights_explode_between_two_steps_is_diverged(two):
     (two.out / "none-0.txt").write_text("explode")
     assert SweepRunner(two).run(two.runs[:1]) == []
-    assert read_states(two)["none/seed_0"].describe() == (
-        "diverged: step 8: scores are not finite"
-    )
+    assert read_states(two)["none/seed_0"].describe() == ("diverged: step 8: scores are not finite")
 
 
 def test_a_run_that_another_process_is_at_is_left_to_it(two, capsys):
@@ -125,7 +123,10 @@ def test_a_job_near_its_end_is_requeued_though_the_training_was_still_at_its_sta
     two, tmp_path, monkeypatch
 ):
     (two.out / "none-0.txt").write_text("wait")  # it knows nothing of SIGUSR1 and dies of it
-    for name, says in {"squeue": "echo RUNNING", "scontrol": f'echo "$*" >> {tmp_path}/said'}.items():
+    for name, says in {
+        "squeue": "echo RUNNING",
+        "scontrol": f'echo "$*" >> {tmp_path}/said',
+    }.items():
         (tmp_path / name).write_text(f"#!/bin/sh\n{says}\n")
         (tmp_path / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")

@@ -120,7 +120,7 @@ def test_what_cannot_be_submitted_says_why(sweep, tools, monkeypatch):
 def test_a_task_that_shares_its_id_with_its_array_asks_for_itself_alone(tools, monkeypatch):
     squeue = tools / "squeue"
     squeue.write_text(
-        '#!/bin/sh\ncase "$*" in *--jobs=7_2*) echo RUNNING;; *) echo PENDING; echo RUNNING;; esac\n'
+        '#!/bin/sh\ncase "$*" in *jobs=7_2*) echo RUNNING;; *) echo PENDING; echo RUNNING;; esac\n'
     )
     squeue.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tools}:/usr/bin:/bin")
