@@ -12,9 +12,10 @@ from l3r.config import load_config
 from l3r.errors import L3RError
 from l3r.launch.expand import Sweep
 from l3r.launch.run_state import RunState
+from l3r.launch.run_table import StepCost
 
 
-def measure_rows(sweep: Sweep, states: Mapping[str, RunState]) -> dict[str, float]:
+def measure_rows(sweep: Sweep, states: Mapping[str, RunState]) -> dict[str, StepCost]:
     """Rehearse a run of every row of which no step was measured.
 
     Args:
@@ -22,11 +23,11 @@ def measure_rows(sweep: Sweep, states: Mapping[str, RunState]) -> dict[str, floa
         states: Of its runs, by name.
 
     Returns:
-        Seconds of a step by row; rows that cannot be rehearsed are left out, with a line on
+        What a step takes by row; rows that cannot be rehearsed are left out, with a line on
         standard error that says why.
     """
     known = {run.row for run in sweep.runs if states[run.name].step_seconds is not None}
-    measured: dict[str, float] = {}
+    measured: dict[str, StepCost] = {}
     for row in sweep.spec.rows:
         run = next(run for run in sweep.runs if run.row == row)
         if row in known or run.config is None:
@@ -34,22 +35,24 @@ def measure_rows(sweep: Sweep, states: Mapping[str, RunState]) -> dict[str, floa
         command = [sys.executable, "-m", "l3r.launch.measure", *run.layers]
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
         if done.returncode == 0:
-            measured[row] = float(done.stdout.split()[-1])
+            seconds, num_devices = done.stdout.split()[-2:]
+            measured[row] = StepCost(float(seconds), int(num_devices) or None)
     return measured
 
 
 def main(layers: Sequence[str]) -> int:
-    """Rehearse one run and print the seconds of a step."""
+    """Rehearse one run and print the seconds of a step, and of how many GPUs; 0: on a CPU."""
     try:
         config = load_config(layers)
         # It brings torch, which the rest of this module does not need.
         from l3r.train.dry_run import rehearse
 
-        seconds = rehearse(config).step_seconds
+        found = rehearse(config)
     except L3RError as error:
         sys.stderr.write(f"rehearsal: {error}\n")
         return 2
-    sys.stdout.write(f"{seconds}\n")
+    num_devices = found.ranks.world_size if found.memory.capacity else 0
+    sys.stdout.write(f"{found.step_seconds} {num_devices}\n")
     return 0
 
 

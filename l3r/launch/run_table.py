@@ -3,22 +3,31 @@
 from collections import Counter
 from collections.abc import Mapping
 from statistics import median
+from typing import NamedTuple
 
 from l3r.launch.expand import Sweep
 from l3r.launch.run_state import RunState
 
 
+class StepCost(NamedTuple):
+    """What a training step takes."""
+
+    seconds: float
+    num_devices: int | None
+    """GPUs; None on a CPU."""
+
+
 def estimate_steps(
-    sweep: Sweep, states: Mapping[str, RunState], measured: Mapping[str, float] | None = None
+    sweep: Sweep, states: Mapping[str, RunState], measured: Mapping[str, StepCost] | None = None
 ) -> dict[str, float]:
     """Give the seconds of a step of each row, where known.
 
     Args:
         sweep: The sweep.
         states: Of its runs, by name: the median of the seeds that have begun.
-        measured: Seconds by row, where none of a row has begun.
+        measured: By row, where none of a row has begun.
     """
-    known = dict(measured or {})
+    known = {row: cost.seconds for row, cost in (measured or {}).items()}
     for row in sweep.spec.rows:
         own = [states[run.name].step_seconds for run in sweep.runs if run.row == row]
         if found := [seconds for seconds in own if seconds is not None]:
@@ -27,17 +36,19 @@ def estimate_steps(
 
 
 def format_runs(
-    sweep: Sweep, states: Mapping[str, RunState], measured: Mapping[str, float] | None = None
+    sweep: Sweep, states: Mapping[str, RunState], measured: Mapping[str, StepCost] | None = None
 ) -> str:
     """Lay out all runs, and what is left to do.
 
     Args:
         sweep: The sweep.
         states: Of its runs, by name.
-        measured: Seconds of a step by row, for rows of which no run has begun.
+        measured: What a step takes by row, for rows of which no run has begun.
     """
     step_seconds = estimate_steps(sweep, states, measured)
-    known = [state.num_devices for state in states.values() if state.num_devices is not None]
+    devices_of = [state.num_devices for state in states.values()]
+    devices_of += [cost.num_devices for cost in (measured or {}).values()]
+    known = [found for found in devices_of if found is not None]
     header = ("run", "differs from the base in", "state", "hours", "GPU hours")
     rows = [header]
     left, gpu_left, unknown = 0.0, 0.0, 0

@@ -5,7 +5,7 @@ import pytest
 from l3r.errors import ConfigError
 from l3r.launch.expand import expand
 from l3r.launch.run_state import FAILURE, read_state, read_states, scoring_request
-from l3r.launch.run_table import estimate_steps, format_runs
+from l3r.launch.run_table import StepCost, estimate_steps, format_runs
 from tests.launch.sweeps import note_bad_steps, score_by_hand, train_by_hand, write_sweep_file
 
 
@@ -128,10 +128,10 @@ def test_the_table_of_runs_has_hours_from_the_steps_of_the_same_row(sweep):
     train_by_hand(runs["0.01/seed_0"], steps=50_000, rate=8.0, machine="NVIDIA H200")
     train_by_hand(runs["0.1/seed_1"], rate=16.0)
     states = read_states(sweep)
-    assert estimate_steps(sweep, states, {"0.1": 9.0}) == {"0.01": 1.0, "0.1": 0.5}
-    assert estimate_steps(sweep, {}.fromkeys(states, states["0.1/seed_0"]), {"0.1": 9.0}) == {
-        "0.1": 9.0
-    }
+    assert estimate_steps(sweep, states, {"0.1": StepCost(9.0, 1)}) == {"0.01": 1.0, "0.1": 0.5}
+    assert estimate_steps(
+        sweep, {}.fromkeys(states, states["0.1/seed_0"]), {"0.1": StepCost(9.0, 1)}
+    ) == {"0.1": 9.0}
     lines = format_runs(sweep, states).splitlines()
     assert lines[1].split()[-2:] == ["28", "222"]
     assert lines[4].split("  ")[0] == "0.1/seed_1"
@@ -139,6 +139,10 @@ def test_the_table_of_runs_has_hours_from_the_steps_of_the_same_row(sweep):
     assert lines[4].split()[-2:] == ["14", "-"]
     # Half of one run and two whole ones of a row, and two of the other; the one on a CPU is done.
     assert lines[-1].endswith("left: 97 hours, 778 GPU hours")
+    rehearsed = format_runs(
+        sweep, {}.fromkeys(states, states["0.1/seed_0"]), {"0.1": StepCost(0.36, 8)}
+    )
+    assert "left: 30 hours, 240 GPU hours, and 3 runs of which" in rehearsed
     assert format_runs(sweep, {}.fromkeys(states, states["0.1/seed_0"])).endswith(
         "6 runs (6 new); left: 0.00 hours, and 6 runs of which no step was measured\n"
     )

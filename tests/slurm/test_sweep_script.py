@@ -28,7 +28,7 @@ def tools(tmp_path):
     for name in ("l3r", "sbatch"):
         (folder / name).write_text('#!/bin/sh\nfor word in "$@"; do echo "$word"; done\n')
     (folder / "scontrol").write_text('#!/bin/sh\n[ "$*" = "show hostnames n[4-5]" ] && echo n4\n')
-    (folder / "python").write_text("#!/bin/sh\necho 0.25\n")
+    (folder / "python").write_text("#!/bin/sh\necho 0.25 8\n")
     for path in folder.iterdir():
         path.chmod(0o755)
     return folder
@@ -133,15 +133,19 @@ def test_a_task_that_shares_its_id_with_its_array_asks_for_itself_alone(tools, m
 
 def test_rows_that_were_never_measured_are_rehearsed(sweep, tools, monkeypatch):
     monkeypatch.setattr(sys, "executable", str(tools / "python"))
-    assert measure_rows(sweep, read_states(sweep)) == {"none": 0.25}, "the other row has begun"
+    assert measure_rows(sweep, read_states(sweep)) == {"none": (0.25, 8)}, "the other row has begun"
 
 
 def test_a_rehearsal_gives_its_seconds(monkeypatch, capsys):
-    found = SimpleNamespace(step_seconds=0.125)
+    memory, ranks = SimpleNamespace(capacity=2**30), SimpleNamespace(world_size=4)
+    found = SimpleNamespace(step_seconds=0.125, memory=memory, ranks=ranks)
     module = SimpleNamespace(rehearse=lambda config: found if config.train.seed == 3 else None)
     monkeypatch.setitem(sys.modules, "l3r.train.dry_run", module)
     assert measure(["train.seed=3"]) == 0
-    assert capsys.readouterr().out == "0.125\n"
+    assert capsys.readouterr().out == "0.125 4\n"
+    memory.capacity = 0
+    assert measure(["train.seed=3"]) == 0
+    assert capsys.readouterr().out == "0.125 0\n"
 
 
 def test_a_rehearsal_that_is_refused_says_so(capsys):
