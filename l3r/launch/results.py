@@ -86,8 +86,7 @@ def collect_results(sweep: Sweep, states: Mapping[str, RunState]) -> SweepResult
         states: Of its runs, by name.
     """
     paper = PAPER_TABLES.get(sweep.spec.table)
-    names = list(sweep.spec.rows)
-    names += [row for row in (paper.rows if paper else {}) if row not in names]
+    names = _order_rows(sweep.spec.rows, paper.rows if paper else {})
     rows = [_collect_row(sweep, states, row, paper) for row in names]
     return SweepResult(
         name=sweep.out.resolve().name,
@@ -129,6 +128,16 @@ def best_of_paper(paper: PaperTable, column: int) -> set[str]:
 def digits_of(metric: str) -> int:
     """How many digits a score is printed with, as in the paper."""
     return 3 if metric == "ate" else 1
+
+
+def _order_rows(ours: Collection[str], papers: Collection[str]) -> list[str]:
+    """Put the paper's rows in its order, and each other one behind the one it stands behind."""
+    names, place = list(papers), 0
+    for row in ours:
+        if row not in names:
+            names.insert(place, row)
+        place = names.index(row) + 1
+    return names
 
 
 def _best(values: Mapping[str, float], metric: str) -> set[str]:

@@ -10,7 +10,7 @@ import numpy as np
 from l3r.export.line_chart import Chart, Curve, Kind, draw_chart
 from l3r.export.run_folder import Table, read_run_folder
 from l3r.files import write_atomic
-from l3r.launch.expand import Sweep
+from l3r.launch.expand import Run, Sweep
 from l3r.launch.paper_tables import METRICS as PAPER_METRICS
 from l3r.launch.results import (
     LOWER_IS_BETTER,
@@ -74,7 +74,7 @@ def render_sweep_page(sweep: Sweep, result: SweepResult, states: Mapping[str, Ru
         columns=[(name, "↓" if key in LOWER_IS_BETTER else "↑") for key, name in METRICS.items()],
         num_paper=len(PAPER_METRICS) if result.paper else 0,
         rows=[_page_row(result, row) for row in result.rows],
-        charts=[chart for chart in draw_curves(sweep, result) if chart],
+        charts=[chart for chart in draw_curves(sweep, result, states) if chart],
         cost_headers=headers,
         cost=[[cell.replace("`", "") for cell in row] for row in cost],
         runs=[(name, state.describe()) for name, state in states.items()],
@@ -82,19 +82,18 @@ def render_sweep_page(sweep: Sweep, result: SweepResult, states: Mapping[str, Ru
     )
 
 
-def draw_curves(sweep: Sweep, result: SweepResult) -> list[Chart | None]:
-    """Draw how the rows train: a curve a row, the mean over its seeds."""
-    labels = {row.row: row.label for row in result.rows}
-    training: dict[str, Table] = {}
-    held_out: dict[str, Table] = {}
-    for row in sweep.spec.rows:
-        folders = [
-            read_run_folder(run.folder)
-            for run in sweep.runs
-            if run.row == row and (run.folder / "metrics.csv").is_file()
-        ]
-        training[labels[row]] = mean_table([folder.training for folder in folders])
-        held_out[labels[row]] = mean_table([folder.validation for folder in folders])
+def draw_curves(
+    sweep: Sweep, result: SweepResult, states: Mapping[str, RunState]
+) -> list[Chart | None]:
+    """Draw how the rows train."""
+    shown = select_runs(sweep, result, states)
+    folders = {
+        label: [read_run_folder(run.folder) for run in runs] for label, runs in shown.items()
+    }
+    training = {label: mean_table([x.training for x in found]) for label, found in folders.items()}
+    held_out = {
+        label: mean_table([x.validation for x in found]) for label, found in folders.items()
+    }
     steps = np.concatenate([[1.0], *(table["step"] for table in training.values())])
     draw = partial(draw_chart, last_step=float(steps.max()))
     return [
@@ -103,6 +102,29 @@ def draw_curves(sweep: Sweep, result: SweepResult) -> list[Chart | None]:
         draw("RRA@15 on validation graphs [%]", _curves(held_out, "rra_15", "dotted")),
         draw("RTA@15 on validation graphs [%]", _curves(held_out, "rta_15", "dotted")),
     ]
+
+
+def select_runs(
+    sweep: Sweep, result: SweepResult, states: Mapping[str, RunState]
+) -> dict[str, list[Run]]:
+    """Give the runs of which each curve is the mean, by its label.
+
+    These are the seeds of a row that came to the end, as others would cut them short; or else those
+    under way. Each run that diverged has a curve of its own.
+    """
+    shown: dict[str, list[Run]] = {}
+    for row in result.rows:
+        begun = [
+            run
+            for run in sweep.runs
+            if run.row == row.row and (run.folder / "metrics.csv").is_file()
+        ]
+        diverged = [run for run in begun if states[run.name].kind == "diverged"]
+        others = [run for run in begun if run not in diverged]
+        whole = [run for run in others if states[run.name].kind in ("trained", "scored")]
+        shown[row.label] = whole or others
+        shown |= {f"{row.label}, seed {run.seed} diverged": [run] for run in diverged}
+    return shown
 
 
 def mean_table(tables: Sequence[Table]) -> Table:

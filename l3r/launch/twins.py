@@ -24,15 +24,21 @@ def find_twins(run: Run) -> Iterator[Path]:
         run: A training of a sweep in ``OUT``; looked for are ``OUT/../SWEEP/ROW/seed_S``.
 
     Yields:
-        Their folders, with weights at the end; whether these are of the last step is not looked at.
+        Folders with weights of an end, made by this version of the code. An end may be one that
+        a longer training has gone on from, which the caller is to find out.
     """
     assert run.config is not None
-    sweep, wanted = run.folder.parents[1], _without_folder(to_yaml(run.config))
+    sweep, wanted = run.folder.parents[1], _but_folder(to_yaml(run.config))
     for path in sorted(sweep.parent.glob(f"*/*/{run.folder.name}/config.yaml")):
         folder = path.parent
         if folder.parents[1] == sweep or not (folder / "model.ckpt").is_file():
             continue
-        if _without_folder(path.read_text(errors="replace")) == wanted and _is_of_this(folder):
+        try:
+            facts = json.loads((folder / "machine.json").read_text())
+            is_twin = _but_folder(path.read_text()) == wanted and facts["light3r"] == __version__
+        except (OSError, ValueError, KeyError, TypeError):
+            continue  # another user's, or damaged
+        if is_twin:
             yield folder
 
 
@@ -68,13 +74,5 @@ def adopt_twin(run: Run, twin: Path) -> None:
     write_atomic(run.folder / "config.yaml", to_yaml(run.config))
 
 
-def _without_folder(text: str) -> list[str]:
+def _but_folder(text: str) -> list[str]:
     return [line for line in text.splitlines() if not line.startswith("  output_dir:")]
-
-
-def _is_of_this(folder: Path) -> bool:
-    """Tell whether this version of the code has trained it."""
-    try:
-        return bool(json.loads((folder / "machine.json").read_text())["light3r"] == __version__)
-    except (OSError, ValueError, KeyError, TypeError):
-        return False

@@ -17,7 +17,7 @@ from l3r.launch.results import best_of_paper, best_rows, collect_results, spread
 from l3r.launch.run_state import FAILURE, read_states, scoring_request
 from l3r.launch.sweep_file import write_sweep
 from l3r.launch.sweep_markdown import format_spread, render_markdown
-from l3r.launch.sweep_report import mean_table, report_sweep
+from l3r.launch.sweep_report import mean_table, render_sweep_page, report_sweep, select_runs
 from tests.launch.sweeps import note_bad_steps, score_by_hand, train_by_hand, write_sweep_file
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "sweep_table.md"
@@ -101,6 +101,32 @@ def test_the_tables_of_the_paper_are_those_of_its_source(shared):
         }
         assert set(table.rows.values()) <= found, name
         assert len(METRICS) == 3
+
+
+def test_rows_stand_in_the_order_of_the_paper_with_ours_in_between(tmp_path):
+    rows = {"1": "loss.global_weight=1", "own": "loss.global_weight=2", "0.1": []}
+    path = write_sweep_file(tmp_path, rows=rows, table="global_weight")
+    sweep = expand(path)
+    result = collect_results(sweep, read_states(sweep))
+    assert [row.row for row in result.rows] == ["0.01", "0.1", "1", "own"]
+
+
+def test_a_diverged_run_has_a_curve_of_its_own_and_cuts_no_other_short(done):
+    diverged, begun = done.runs[0], done.runs[3]
+    undo(diverged, steps=30)
+    note_bad_steps(diverged, [30, 31, 32])
+    undo(begun, steps=2)
+    states = read_states(done)
+    result = collect_results(done, states)
+    shown = select_runs(done, result, states)
+    names = {label: [run.name for run in runs] for label, runs in shown.items()}
+    assert names == {
+        "0.01": ["0.01/seed_1", "0.01/seed_2"],
+        "0.01, seed 0 diverged": ["0.01/seed_0"],
+        "0.1": ["0.1/seed_0", "0.1/seed_2"],
+        "1": [],
+    }
+    assert "0.01, seed 0 diverged" in render_sweep_page(done, result, states)
 
 
 def test_one_seed_has_no_deviation_and_missing_values_are_a_dash():

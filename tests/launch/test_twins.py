@@ -76,13 +76,15 @@ def test_another_configuration_is_no_twin(first, tmp_path, monkeypatch, change):
     assert {state.kind for state in read_states(sweep).values()} == {"new"}
 
 
-@pytest.mark.parametrize("spoilt", ["unfinished", "seed", "version"])
+@pytest.mark.parametrize("spoilt", ["unfinished", "seed", "version", "damaged"])
 def test_what_is_not_finished_or_of_another_seed_or_version_is_no_twin(
     first, tmp_path, monkeypatch, spoilt
 ):
     sweep = second(tmp_path, monkeypatch, seeds=[1] if spoilt == "seed" else [0])
     if spoilt == "unfinished":
         train_by_hand(first.runs[0], steps=99)
+    if spoilt == "damaged":
+        (first.runs[0].folder / "machine.json").write_text("[")
     if spoilt == "version":
         path = first.runs[0].folder / "machine.json"
         path.write_text(path.read_text().replace('"light3r": "', '"light3r": "9'))
