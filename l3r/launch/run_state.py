@@ -83,7 +83,8 @@ def read_state(run: Run, request: Mapping[str, Any]) -> RunState:
         said = failure.read_text().strip()
         return replace(state, kind="failed", detail=f"{said}; see {run.folder / LOG}")
     is_at_end = state.kind == "begun" and state.step == state.max_steps
-    if state.kind not in ("trained", "waiting") and not is_at_end:
+    is_without_weights = is_at_end and not run.checkpoint.is_file()
+    if state.kind not in ("trained", "waiting") and not is_without_weights:
         return state
     scores = read_scores(run, request)
     if scores is None:
@@ -151,9 +152,16 @@ def _trained_state(run: Run) -> RunState:
     state = replace(state, **_measured(folder, run.config), twin=read_twin(run))
     if bad := _last_bad_step(folder, run.config.train.max_bad_steps):
         return replace(state, kind="diverged", detail=bad)
-    if folder.is_complete and state.step >= run.config.train.max_steps:
+    is_written = folder.is_complete and not _is_superseded(run)
+    if is_written and state.step >= run.config.train.max_steps:
         return replace(state, kind="trained")
     return replace(state, kind="begun" if len(folder.training["step"]) else "new")
+
+
+def _is_superseded(run: Run) -> bool:
+    """Tell whether weights are those of a shorter training, which has gone on and saved since."""
+    last, weights = run.folder / "last.ckpt", run.folder / "model.ckpt"
+    return last.is_file() and last.stat().st_mtime > weights.stat().st_mtime
 
 
 def _measured(folder: RunFolder, config: RunConfig) -> dict[str, Any]:

@@ -49,6 +49,18 @@ def test_scores_outlive_the_checkpoint_and_a_training_that_was_cut_short_does_no
     assert state().kind == "begun"
 
 
+def test_a_longer_training_that_was_killed_before_it_wrote_its_weights_is_not_scored(sweep, state):
+    run = sweep.runs[0]
+    train_by_hand(run)
+    (run.folder / "last.ckpt").write_bytes(b"all")
+    later = run.checkpoint.stat().st_mtime
+    os.utime(run.folder / "last.ckpt", (later - 5, later - 5))
+    score_by_hand(run, scoring_request(sweep))
+    assert state().kind == "scored"
+    os.utime(run.folder / "last.ckpt", (later + 5, later + 5))
+    assert state().describe() == "goes on, reached step 100,000 of 100,000"
+
+
 def test_a_finished_run_with_another_start_is_not_taken_for_this_one(tmp_path):
     rows = {"scratch": [], "start": "train.init=weights/start"}
     sweep = expand(write_sweep_file(tmp_path, rows=rows))

@@ -24,6 +24,8 @@ def first(tmp_path):
     )
     sweep = expand(file)
     for run in sweep.runs:
+        run.folder.mkdir(parents=True)
+        (run.folder / "last.ckpt").write_bytes(b"all")
         train_by_hand(run)
     score_by_hand(sweep.runs[0], scoring_request(sweep))
     return sweep
