@@ -30,7 +30,7 @@ test: install
 	$(PYTEST) --numprocesses $(JOBS) --dist loadfile
 
 test-slow: install
-	$(PYTEST) --numprocesses $(JOBS) --dist loadfile -m "slow and not gpu and not slurm"
+	$(PYTEST) --numprocesses $(JOBS) --dist worksteal -m "slow and not gpu and not slurm"
 
 # On a real SLURM of two nodes, which it starts and ends; docs/cluster.md says what it needs.
 test-slurm: install

@@ -5,7 +5,9 @@ resumed run goes on with the very next sample whatever the workers had read ahea
 """
 
 import logging
+import os
 import signal
+import tempfile
 import threading
 import time
 from collections import deque
@@ -28,6 +30,8 @@ log = logging.getLogger(__name__)
 LOG_SKIP_EVERY = 100
 SKIP_WINDOW = 1000
 """Samples over which the rate of unreadable ones is taken."""
+MAX_TEMPORARY_PATH = 107 - len("/pymp-12345678/listener-12345678")
+"""Longest path, in bytes, that leaves room for a socket's name as Python makes it."""
 GRACE_SECONDS = 10
 """For how long a loader process that is told to end goes on delivering."""
 
@@ -183,9 +187,12 @@ def read_ahead(
         pin_memory: Whether items go to an accelerator.
 
     Raises:
+        ConfigError: The path of the folder for temporary files is too long.
         LaunchError: A process died.
     """
     has_workers = config.num_workers > 0
+    if has_workers:
+        _require_short_paths()
     loader = DataLoader(
         dataset,
         batch_size=None,
@@ -244,3 +251,15 @@ def _warn_of_idle_settings(config: DataConfig) -> None:
     for applies, words in idle:
         if applies:
             log.warning("no effect of %s", words)
+
+
+def _require_short_paths() -> None:
+    """Refuse a folder in which batches could not be handed over: the taker would wait for ever."""
+    folder = tempfile.gettempdir()
+    found = len(os.fsencode(folder))
+    if found > MAX_TEMPORARY_PATH:
+        raise ConfigError(
+            f"TMPDIR={folder} has {found} bytes, expected {MAX_TEMPORARY_PATH} at most, since "
+            "loader processes open sockets there; set TMPDIR to a folder with a shorter name, or "
+            "data.num_workers=0"
+        )

@@ -3,14 +3,16 @@
 import multiprocessing
 import os
 import signal
+import tempfile
 import time
+from pathlib import Path
 
 import pytest
 import torch
 
-from l3r.data.loader import build_training_loader
+from l3r.data.loader import MAX_TEMPORARY_PATH, build_training_loader
 from l3r.data.steps import DeviceShare, StepBatch
-from l3r.errors import LaunchError
+from l3r.errors import ConfigError, LaunchError
 from tests.data.described import data_config, datasets
 from tests.data.graphs import make_graph, write_folder
 
@@ -69,3 +71,23 @@ def test_batches_of_other_processes_arrive_pinned(folder):
     share = DeviceShare()
     loader = build_training_loader(config, (32, 32), seed=0, num_steps=2, share=share)
     assert all(batch.image.is_pinned() for batch in loader)
+
+
+@pytest.mark.parametrize("length", [MAX_TEMPORARY_PATH, MAX_TEMPORARY_PATH + 1])
+def test_a_folder_for_temporary_files_with_too_long_a_name_is_refused(folder, monkeypatch, length):
+    """Sockets are made there; where they cannot be, torch prints a traceback and waits for ever."""
+    with tempfile.TemporaryDirectory(prefix="l3r-", dir="/tmp") as short:
+        place = Path(short, "x" * (length - len(short) - 1))
+        place.mkdir()
+        monkeypatch.setenv("TMPDIR", str(place))
+        # Python remembers the folder that sockets were made in before.
+        monkeypatch.setattr(tempfile, "tempdir", str(place))
+        monkeypatch.delitem(multiprocessing.process.current_process()._config, "tempdir", False)
+        config = data_config(folder, num_workers=1, prefetch_factor=1)
+        share = DeviceShare()
+        loader = build_training_loader(config, (32, 32), seed=0, num_steps=2, share=share)
+        if length > MAX_TEMPORARY_PATH:
+            with pytest.raises(ConfigError, match=r"TMPDIR=.* 76 bytes, expected 75 at most"):
+                next(iter(loader))
+        else:
+            assert len(list(loader)) == 2

@@ -32,14 +32,15 @@ def in_the_repository(monkeypatch):
 
 
 @pytest.fixture(autouse=True)
-def temporary(monkeypatch, tmp_path):
-    """The folder for temporary files; a test that leaves one fails."""
-    folder = tmp_path / "temporary"
-    folder.mkdir()
+def temporary(monkeypatch):
+    """The folder for temporary files, of a short name for sockets; who leaves one fails."""
+    folder = Path(tempfile.mkdtemp(prefix="l3r-", dir="/tmp"))
     monkeypatch.setenv("TMPDIR", str(folder))
     monkeypatch.setattr(tempfile, "tempdir", None)
     yield folder
-    assert not [*folder.iterdir()]
+    left = [*folder.iterdir()]
+    shutil.rmtree(folder)
+    assert not left
 
 
 def command(*arguments):
