@@ -38,8 +38,13 @@ def test_a_resumed_run_goes_on_with_its_run_of_weights_and_biases(hand_shards, t
     name = (tmp_path / "wandb_id.txt").read_text().strip()
     runs = sorted((tmp_path / "wandb").glob("offline-run-*"))
     assert runs
-    assert all(run.name.endswith(f"-{name}") for run in runs)
+    assert all(is_named(run, name) for run in runs)
     assert all((run / f"run-{name}.wandb").stat().st_size > 0 for run in runs)
+
+
+def is_named(run, name):
+    """Two that start in the same second are told apart by a number at the end."""
+    return re.search(rf"-{name}(-\d+)?$", run.name) is not None
 
 
 def test_a_run_whose_name_was_lost_goes_on_with_it(hand_shards, tmp_path):
@@ -53,8 +58,7 @@ def test_a_run_whose_name_was_lost_goes_on_with_it(hand_shards, tmp_path):
     assert names[0] == names[1]
     runs = [*(tmp_path / "wandb").glob("offline-run-*")]
     assert len(runs) == 2
-    # Two that start in the same second are told apart by a number at the end.
-    assert all(re.search(rf"-{names[0].strip()}(-\d+)?$", run.name) for run in runs)
+    assert all(is_named(run, names[0].strip()) for run in runs)
 
 
 def test_a_missing_package_is_a_clear_error_before_anything_is_written(
