@@ -203,7 +203,7 @@ def _notes(paper: PaperTable | None, states: Collection[RunState]) -> list[str]:
             f"{name} {format_score(found[metric], metric)}" for metric, name in METRICS.items()
         )
         notes.append(
-            "Validation columns: full inference on held-out graphs, pairs of unregistered images "
+            "Validation scores: full inference on held-out graphs, pairs of unregistered images "
             f"count as failed; all cameras at one place would score {shown}."
         )
     return [*notes, *(paper.notes if paper else ())]

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from l3r.launch.paper_tables import METRICS as PAPER_METRICS
+from l3r.launch.paper_tables import PaperTable
 from l3r.launch.results import (
     LOWER_IS_BETTER,
     METRICS,
@@ -19,16 +20,18 @@ from l3r.launch.results import (
 
 def render_markdown(result: SweepResult) -> str:
     """Give the tables of a sweep, ready to be read or pasted."""
-    lines = [f"# {result.paper.title if result.paper else result.name}", ""]
+    lines = [f"# {result.paper.title if result.paper else result.name}"]
     if result.paper:
         lines += [
+            "",
             f'Sweep {result.name}. Paper: {result.paper.source}; {result.paper.benchmark}. "ours" '
             'is the same benchmark, "-" until it is measured.',
             "",
+            *_table(*_paper_table(result, result.paper)),
         ]
-    if result.scored_on:
-        lines += [f"Validation: {result.scored_on}. {_spread_words(result)}", ""]
-    lines += _table(_headers(result), [_cells(result, row) for row in result.rows])
+    scored_on = f"{result.scored_on}. " if result.scored_on else ""
+    lines += ["", f"Validation: {scored_on}{_spread_words(result)}", ""]
+    lines += _table(*_validation_table(result))
     lines += ["", *_table(*cost_table(result))]
     if result.problems:
         lines += ["", *(f"* {problem}" for problem in result.problems)]
@@ -90,26 +93,36 @@ def _arrow(metric: str) -> str:
     return "↓" if metric in LOWER_IS_BETTER else "↑"
 
 
-def _headers(result: SweepResult) -> list[str]:
+def _paper_table(result: SweepResult, paper: PaperTable) -> tuple[list[str], list[list[str]]]:
     headers = [_first_header(result)]
-    if result.paper:
-        for name, metric in zip(PAPER_METRICS, METRICS, strict=False):
-            headers += [f"{name} {_arrow(metric)} paper", "ours"]
-    headers += [f"validation {name} {_arrow(metric)}" for metric, name in METRICS.items()]
-    return [*headers, "runs"]
-
-
-def _cells(result: SweepResult, row: RowResult) -> list[str]:
-    cells = [row.label]
-    if result.paper:
+    for name, metric in zip(PAPER_METRICS, METRICS, strict=False):
+        headers += [f"{name} {_arrow(metric)}", "ours"]
+    rows = []
+    for row in result.rows:
+        cells = [row.label]
         for column, metric in enumerate(list(METRICS)[: len(PAPER_METRICS)]):
-            found = result.paper.rows.get(row.row)
+            found = paper.rows.get(row.row)
             text = format_score(found[column] if found else None, metric)
-            cells += [_bold(text, row.row in best_of_paper(result.paper, column)), "-"]
-    for metric in METRICS:
-        text = format_spread(row.scores.get(metric), metric, len(row.kinds))
-        cells.append(_bold(text, row.row in best_rows(result, metric)))
-    return [*cells, describe_kinds(row)]
+            cells += [_bold(text, row.row in best_of_paper(paper, column)), "-"]
+        rows.append(cells)
+    return headers, rows
+
+
+def _validation_table(result: SweepResult) -> tuple[list[str], list[list[str]]]:
+    headers = [_first_header(result), *(f"{n} {_arrow(m)}" for m, n in METRICS.items()), "runs"]
+    rows = []
+    for row in result.rows:
+        if not row.kinds:
+            continue
+        cells = [
+            _bold(
+                format_spread(row.scores.get(metric), metric, len(row.kinds)),
+                row.row in best_rows(result, metric),
+            )
+            for metric in METRICS
+        ]
+        rows.append([row.label, *cells, describe_kinds(row)])
+    return headers, rows
 
 
 def _bold(text: str, is_best: bool) -> str:
@@ -117,5 +130,7 @@ def _bold(text: str, is_best: bool) -> str:
 
 
 def _table(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    lines = [headers, ["---"] * len(headers), *rows]
-    return ["| " + " | ".join(line) + " |" for line in lines]
+    """Lay out columns one under the other, so that it can be read as it stands."""
+    widths = [max(map(len, column)) for column in zip(headers, *rows, strict=True)]
+    lines = [headers, ["-" * width for width in widths], *rows]
+    return ["| " + " | ".join(map(str.ljust, line, widths)) + " |" for line in lines]

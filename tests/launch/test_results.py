@@ -103,6 +103,15 @@ def test_the_tables_of_the_paper_are_those_of_its_source(shared):
         assert len(METRICS) == 3
 
 
+def test_the_notes_quote_numbers_that_the_paper_prints(shared):
+    source = (shared / "paper" / "light3r-sfm.tex.txt").read_text()
+    for name, table in PAPER_TABLES.items():
+        quoted = re.findall(r"\b\d+\.\d+\b", " ".join(table.notes))
+        assert set(quoted) <= set(re.findall(r"\b\d+\.\d+\b", source)), name
+        for where in re.findall(r"tables/\w+(?:/\w+)?", " ".join(table.notes)):
+            assert f"%% file: {where}.tex" in source, name
+
+
 def test_rows_stand_in_the_order_of_the_paper_with_ours_in_between(tmp_path):
     rows = {"1": "loss.global_weight=1", "own": "loss.global_weight=2", "0.1": []}
     path = write_sweep_file(tmp_path, rows=rows, table="global_weight")
@@ -194,7 +203,7 @@ def test_a_damaged_description_is_refused(done):
 def test_a_sweep_without_a_table_of_the_paper_has_its_own(tmp_path):
     sweep = expand(write_sweep_file(tmp_path, seeds=[0]))
     text = render_markdown(collect_results(sweep, read_states(sweep)))
-    assert "| row | validation RRA@5 ↑" in text
+    assert "\n| row   | RRA@5 ↑ | RTA@5 ↑ |" in text
     assert "paper" not in text.replace("| paper |", "")
     assert "1 to come" in text
 
