@@ -52,6 +52,6 @@ def run(args: argparse.Namespace) -> int:
         return 0
     share = sweep.share(args.task_index, args.tasks)
     launcher = shlex.split(args.launcher)
-    text, failed = sweep_job.run_share(sweep, share, jobs=args.jobs, launcher=launcher)
+    text, left = sweep_job.run_share(sweep, share, jobs=args.jobs, launcher=launcher)
     sys.stdout.write(f"\n{text}")
-    return 1 if failed else 0
+    return 1 if left else 0

@@ -16,9 +16,10 @@ class SampleChooser:
     """Choose a source and a graph for each global slot of each step.
 
     The choice depends on (seed, step, global slot) and on nothing else: another number of devices
-    or workers sees the same samples, and no state must be kept but the step. A source alone runs
-    through a permutation of its graphs before any comes again; of several, each uses those parts
-    of its permutations that its slots fall on.
+    or workers sees the same samples, and no state must be kept but the step. Slots are counted
+    over all steps, so that another number of slots a step gives the same graphs in the same order.
+    A source alone runs through a permutation of its graphs before any comes again; of several,
+    each uses those parts of its permutations that its slots fall on.
 
     Args:
         sizes: Graphs of each source.
@@ -37,12 +38,12 @@ class SampleChooser:
 
     def choose(self, step: int, slot: int) -> tuple[int, int]:
         """Return (source, graph within it) for one slot of one step."""
-        source = 0
+        place, source = step * self.slots_per_step + slot, 0
         if len(self.sizes) > 1:
-            draw = np.random.default_rng((self.seed, DRAW_SOURCE, step, slot)).random()
+            draw = np.random.default_rng((self.seed, DRAW_SOURCE, place)).random()
             source = min(int(np.searchsorted(self.share, draw, side="right")), len(self.sizes) - 1)
         # Counted over the slots of all sources: a source uses part of each of its permutations.
-        epoch, position = divmod(step * self.slots_per_step + slot, self.sizes[source])
+        epoch, position = divmod(place, self.sizes[source])
         order = _permutation(self.seed, source, epoch, self.sizes[source])
         return source, int(order[position])
 

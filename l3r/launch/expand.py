@@ -16,6 +16,8 @@ from l3r.launch.sweep_config import SweepConfig, load_sweep
 
 SET_BY_SWEEP = ("train.seed", "train.output_dir")
 """Keys that say which run of the sweep it is."""
+_SCORED_ALIKE = "data.validation."
+"""Keys that say on what all rows are scored."""
 Changes = dict[str, dict[str, tuple[Any, Any]]]
 """(base's value, row's value) by key, of each row."""
 _SCORED_SECTIONS = ("graph", "inference", "data")
@@ -78,6 +80,7 @@ class Sweep:
         Raises:
             ConfigError: There is no such task.
         """
+        require(tasks >= 1, "--tasks", tasks, "1 or more")
         require(0 <= task < tasks, "--task-index", task, f"0 to {tasks - 1} of --tasks {tasks}")
         return self.runs[task::tasks]
 
@@ -92,7 +95,8 @@ def expand(file: Path, extra: Sequence[str] = (), out: Path | None = None) -> Sw
 
     Raises:
         ConfigError: The file or a layer cannot be used, two rows are the same run, a row sets what
-            the sweep sets, or rows differ in images a step.
+            the sweep sets or what it is scored on, rows differ in the number of images, or there is
+            nothing to score on.
     """
     spec = load_sweep(file)
     folder = out or Path(spec.output_dir)
@@ -105,6 +109,11 @@ def expand(file: Path, extra: Sequence[str] = (), out: Path | None = None) -> Sw
         num_views = spec.evaluate.num_views
     else:
         base = load_config([*spec.base, *extra])
+        if not (spec.evaluate.shards or base.data.validation):
+            raise ConfigError(
+                f"{file}: nothing to score on; add data.validation.NAME.shards=FOLDER to the base "
+                "or to the command line, or evaluate.shards to the file"
+            )
         changes, runs = _trained_runs(spec, tuple(extra), folder, base)
         num_views = spec.evaluate.num_views or base.data.num_views
     _refuse_same_rows(file, changes)
@@ -129,6 +138,10 @@ def _trained_runs(
     for row, changed in changes.items():
         if found := [key for key in SET_BY_SWEEP if key in changed]:
             raise ConfigError(f"rows.{row} sets {found[0]}, which the sweep sets; leave it out")
+        if found := [key for key in changed if key.startswith(_SCORED_ALIKE)]:
+            raise ConfigError(
+                f"rows.{row} sets {found[0]}, but all rows are scored alike; put it into the base"
+            )
     runs = []
     for seed in spec.seeds:
         for row, config in configs.items():
@@ -203,15 +216,25 @@ def _refuse_same_rows(file: Path, changes: Changes) -> None:
 
 
 def require_equal_images(file: Path, configs: dict[str, RunConfig]) -> None:
-    """Refuse rows that no single number of images a step, rounded to whole graphs, would give.
+    """Refuse rows that see more or fewer images than others.
+
+    They must have as many steps, and images a step that a single number, rounded to whole graphs,
+    would give.
 
     Args:
         file: The sweep file, for the message.
         configs: By row.
 
     Raises:
-        ConfigError: They see more or fewer images than others.
+        ConfigError: They do not.
     """
+    steps = {row: config.train.max_steps for row, config in configs.items()}
+    if len(set(steps.values())) > 1:
+        found = ", ".join(f"{row}: {number:,}" for row, number in steps.items())
+        raise ConfigError(
+            f"{file}: train.max_steps differs between rows ({found}), expected as many; leave it "
+            "to the base, or set equal_images: false to compare them all the same"
+        )
     data = {row: config.data for row, config in configs.items()}
     lowest = max(((d.graphs_per_step - 0.5) * d.num_views for d in data.values()), default=0)
     highest = min(((d.graphs_per_step + 0.5) * d.num_views for d in data.values()), default=0)

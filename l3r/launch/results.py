@@ -51,10 +51,9 @@ class RowResult:
     hours: float | None
     """Of one training."""
 
-    @property
-    def is_whole(self) -> bool:
-        """Whether every seed has scores."""
-        return bool(self.kinds) and all(kind == "scored" for kind in self.kinds)
+    def has_whole(self, metric: str) -> bool:
+        """Whether every seed has this score."""
+        return metric in self.scores and self.scores[metric].count == len(self.kinds)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,12 +69,6 @@ class SweepResult:
     """What a reader of the table must know."""
     problems: Sequence[str]
     """A line for each run that diverged or failed."""
-
-    @property
-    def is_over(self) -> bool:
-        """Whether no run is left to do."""
-        kinds = [kind for row in self.rows for kind in row.kinds]
-        return all(kind in ("scored", "diverged", "failed") for kind in kinds)
 
 
 def collect_results(sweep: Sweep, states: Mapping[str, RunState]) -> SweepResult:
@@ -113,7 +106,7 @@ def best_rows(result: SweepResult, metric: str) -> set[str]:
     means = {
         row.row: round(row.scores[metric].mean, digits_of(metric))
         for row in result.rows
-        if row.is_whole and metric in row.scores and not _is_unranked(result.paper, row.row)
+        if row.has_whole(metric) and not _is_unranked(result.paper, row.row)
     }
     return _best(means, metric)
 
@@ -197,28 +190,36 @@ def _notes(paper: PaperTable | None, states: Collection[RunState]) -> list[str]:
             "The runs were scored on different graphs and must not be compared: shards were built "
             "anew in between. Remove the scores.json of all runs and run the sweep again."
         )
+    places = {tuple(sorted(state.trained_on.items())) for state in states if state.trained_on}
+    if len(places) > 1:
+        named = " and ".join(", ".join(place for _, place in found) for found in sorted(places))
+        notes.append(
+            f"The runs were trained on shards of different places: {named}. Compare them only if "
+            "these hold the same graphs."
+        )
     if scored:
         found = scored[0]["identity"]
         shown = ", ".join(
             f"{name} {format_score(found[metric], metric)}" for metric, name in METRICS.items()
         )
         notes.append(
-            "Validation scores: full inference on held-out graphs, pairs of unregistered images "
-            f"count as failed; all cameras at one place would score {shown}."
+            "Validation scores: full inference on held-out graphs; pairs of unregistered images "
+            "count as failed, ATE is of the registered ones alone. All cameras at one place would "
+            f"score {shown}."
         )
     return [*notes, *(paper.notes if paper else ())]
 
 
 def _twins(sweep: Sweep, states: Mapping[str, RunState]) -> list[str]:
-    """Name the rows that another sweep has trained."""
-    labels = {
-        "/".join(twin.parts[-3:-1]): run.row
-        for run in sweep.runs
-        if (twin := states[run.name].twin)
-    }
+    """Name the runs that another sweep has trained, by row."""
+    seeds: dict[tuple[str, str], list[int]] = {}
+    for run in sweep.runs:
+        if twin := states[run.name].twin:
+            seeds.setdefault((run.row, "/".join(twin.parts[-3:-1])), []).append(run.seed)
     return [
-        f"Row {row} was trained as {twin}, with the same configuration and seeds."
-        for twin, row in labels.items()
+        f"Row {row}, seed{'s' if len(found) > 1 else ''} {', '.join(map(str, found))}: trained as "
+        f"{twin}, with the same configuration."
+        for (row, twin), found in seeds.items()
     ]
 
 

@@ -1,8 +1,7 @@
 """How far a run of a sweep is, from its folder alone; needs no torch."""
 
-import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,6 +12,7 @@ from l3r.errors import ConfigError
 from l3r.export.run_folder import RunFolder, read_run_folder
 from l3r.export.run_report import recent_rate
 from l3r.launch.expand import Run, Sweep
+from l3r.launch.score_file import read_scores, scoring_request
 from l3r.launch.twins import find_twins, read_twin
 
 Kind = Literal["new", "waiting", "begun", "trained", "scored", "diverged", "failed"]
@@ -44,6 +44,8 @@ class RunState:
     """Peak memory on a GPU."""
     num_devices: int | None = None
     """GPUs that it was last trained on; None on a CPU, or where it never began."""
+    trained_on: Mapping[str, str] = field(default_factory=dict)
+    """Places of the shards that it was last trained on, by source."""
     twin: Path | None = None
     """Folder of the same training in a neighbouring sweep, that it was or will be taken from."""
 
@@ -83,8 +85,7 @@ def read_state(run: Run, request: Mapping[str, Any]) -> RunState:
         said = failure.read_text().strip()
         return replace(state, kind="failed", detail=f"{said}; see {run.folder / LOG}")
     is_at_end = state.kind == "begun" and state.step == state.max_steps
-    is_without_weights = is_at_end and not run.checkpoint.is_file()
-    if state.kind not in ("trained", "waiting") and not is_without_weights:
+    if state.kind not in ("trained", "waiting") and not is_at_end:
         return state
     scores = read_scores(run, request)
     if scores is None:
@@ -100,37 +101,6 @@ def read_states(sweep: Sweep) -> dict[str, RunState]:
     return {run.name: read_state(run, request) for run in sweep.runs}
 
 
-def scoring_request(sweep: Sweep) -> dict[str, Any]:
-    """Give what the scores of a sweep depend on beside the network."""
-    evaluate = sweep.spec.evaluate
-    return {
-        "shards": evaluate.shards,
-        "num_views": sweep.num_views,
-        "max_graphs": evaluate.max_graphs,
-    }
-
-
-def read_scores(run: Run, request: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Read ``scores.json``; None where there is none of this request and this checkpoint.
-
-    Scores outlive a checkpoint that was removed, or is named from another folder.
-    """
-    path = run.folder / "scores.json"
-    try:
-        scores = dict(json.loads(path.read_text()))
-        has_weights = run.checkpoint.is_file()
-        is_stale = has_weights and path.stat().st_mtime < run.checkpoint.stat().st_mtime
-    except (OSError, ValueError, TypeError):
-        return None
-    wanted = {**request, "settings": _settings_of(run)}
-    return None if is_stale or scores.get("request") != wanted else scores
-
-
-def _settings_of(run: Run) -> list[str]:
-    """Changes to a checkpoint that is only scored; a training's are in its checkpoint."""
-    return [] if run.config is not None else list(run.layers)
-
-
 def _scored_state(run: Run) -> RunState:
     if not run.checkpoint.is_file():
         return RunState(kind="waiting", detail=f"no {run.checkpoint} yet")
@@ -141,15 +111,20 @@ def _trained_state(run: Run) -> RunState:
     assert run.config is not None
     state = RunState(kind="new", max_steps=run.config.train.max_steps)
     if not (run.folder / "config.yaml").is_file():
-        for twin in find_twins(run):
-            found = _trained_state(replace(run, folder=twin))
+        for other in find_twins(run):
+            found = _trained_state(replace(run, folder=other))
             if found.kind == "trained":
-                return replace(found, twin=twin)
+                return replace(found, twin=other)
         return state
     folder = read_run_folder(run.folder)
-    if folder.config is not None:
-        _require_same(run.folder / "config.yaml", folder.config, run.config)
-    state = replace(state, **_measured(folder, run.config), twin=read_twin(run))
+    if folder.config is None:
+        raise ConfigError(
+            f"{run.folder / folder.problems[0]}; mend it, or give --out or output_dir for new runs"
+        )
+    _require_same(run.folder / "config.yaml", folder.config, run.config)
+    places = {name: source.shards for name, source in folder.config.data.sources.items()}
+    twin = read_twin(run)
+    state = replace(state, **_measured(folder, run.config), trained_on=places, twin=twin)
     if bad := _last_bad_step(folder, run.config.train.max_bad_steps):
         return replace(state, kind="diverged", detail=bad)
     is_written = folder.is_complete and not _is_superseded(run)
@@ -204,6 +179,8 @@ def _require_same(path: Path, found: RunConfig, wanted: RunConfig) -> None:
     from l3r.train.checkpointing import may_change
 
     for key, (old, new) in changes.items():
+        if key.startswith("data.validation."):
+            continue  # changes nothing that is learnt, and scores say what they are of
         # A run that is resumed does not read it again; a run of a sweep is told by it.
         if key == "train.init" or not may_change(key, wanted):
             raise ConfigError(

@@ -13,14 +13,15 @@ from pathlib import Path
 from typing import Literal
 
 from l3r.config.check import require
-from l3r.errors import LaunchError
+from l3r.errors import ConfigError, LaunchError
 from l3r.files import write_atomic
 from l3r.launch.expand import Run, Sweep
 from l3r.launch.run_lock import RunLock
-from l3r.launch.run_state import FAILURE, LOG, OVER, RunState, read_state, scoring_request
+from l3r.launch.run_state import FAILURE, LOG, OVER, RunState, read_state
+from l3r.launch.score_file import scoring_request
 from l3r.launch.slurm import job_is_leaving
 from l3r.launch.sweep_progress import SweepProgress
-from l3r.launch.twins import adopt_twin
+from l3r.launch.twins import TAKEN_FROM, adopt_twin
 from l3r.train.signals import requeue_job
 
 _POLL_SECONDS = 0.2
@@ -70,7 +71,8 @@ class SweepRunner:
         A run that fails is noted, and the next one begins.
 
         Returns:
-            Names of those that failed.
+            Names of those that are not over: they failed, wait for a checkpoint, or others are at
+            them.
 
         Raises:
             KeyboardInterrupt: Asked to stop; the runs have saved where they are.
@@ -88,10 +90,15 @@ class SweepRunner:
             except BaseException:
                 self._stop()
                 raise
-        return [run.name for run in runs if self._state(run).kind == "failed"]
+        return [run.name for run in runs if self._state(run).kind not in OVER]
 
     def _begin(self, run: Run) -> None:
-        state = self._state(run)
+        try:
+            state = read_state(run, self.request)
+        except ConfigError as error:
+            # The folder is another run's, and stays as it is.
+            self.progress.end(run, f"failed: {error}")
+            return
         if state.kind in OVER or state.kind == "waiting":
             self.progress.end(run, state.describe())
             return
@@ -110,6 +117,9 @@ class SweepRunner:
             self.progress.end(run, state.describe())
             return
         stage: Stage = "score" if state.kind == "trained" else "train"
+        if stage == "train":
+            # What it goes on to is no longer what it was taken from.
+            (run.folder / TAKEN_FROM).unlink(missing_ok=True)
         self.active.append(self._start(run, stage, lock, time.monotonic()))
 
     def _start(self, run: Run, stage: Stage, lock: RunLock, began: float) -> _Active:
@@ -209,7 +219,11 @@ class SweepRunner:
                 active.lock.release()
 
     def _state(self, run: Run) -> RunState:
-        return read_state(run, self.request)
+        """Read how far a run is; a folder that turns out to be another run's fails it alone."""
+        try:
+            return read_state(run, self.request)
+        except ConfigError as error:
+            return RunState(kind="failed", detail=str(error))
 
 
 def explain_exit(code: int, log: Path) -> str:
@@ -221,7 +235,10 @@ def explain_exit(code: int, log: Path) -> str:
     """
     with log.open("rb") as stream:
         stream.seek(max(0, log.stat().st_size - _TAIL))
-        lines = [line for line in stream.read().decode(errors="replace").splitlines() if line]
+        said = stream.read().decode(errors="replace").splitlines()
+    # Lines before the last command's are of another process.
+    starts = [number for number, line in enumerate(said) if line.startswith("$ ")]
+    lines = [line for line in said[starts[-1] + 1 if starts else 0 :] if line]
     errors = [line for line in lines if line.startswith("l3r ")] or lines[-1:]
     how = f"exit code {code}" if code >= 0 else f"killed by signal {-code}"
-    return f"{how}: {errors[-1]}" if errors and not errors[-1].startswith("$ ") else how
+    return f"{how}: {errors[-1]}" if errors else how

@@ -1,7 +1,6 @@
 """Score what a run has made on the graphs that all runs of its sweep are scored on."""
 
 import hashlib
-import json
 from typing import Any
 
 import torch
@@ -10,11 +9,10 @@ from l3r.config import RunConfig, SourceConfig, override_config
 from l3r.data.source import ShardFolder, open_store
 from l3r.errors import ConfigError, NotFiniteError
 from l3r.eval.graphs import GraphScores, evaluate_opened
-from l3r.files import write_atomic
 from l3r.inference.checkpoint import load_model_and_config
 from l3r.inference.job import choose_device
 from l3r.launch.expand import Run, Sweep
-from l3r.launch.run_state import scoring_request
+from l3r.launch.score_file import describe_scored, scoring_request, write_scores
 from l3r.metrics.cameras import mean_metrics
 from l3r.model.light3r import Light3R
 
@@ -43,8 +41,7 @@ def score_run(sweep: Sweep, run: Run) -> dict[str, Any]:
     model, config = load_model_and_config(run.checkpoint, device, own)
     config = override_config(config, [text for text in settings if text not in own], ("data",))
     content: dict[str, Any] = {
-        "version": 1,
-        "request": {**scoring_request(sweep), "settings": settings},
+        **describe_scored(run, scoring_request(sweep), config.train.max_steps),
         "problem": "",
         "network": None,
         "identity": None,
@@ -58,8 +55,7 @@ def score_run(sweep: Sweep, run: Run) -> dict[str, Any]:
             content |= _score_sources(sweep, model, config, run.config or config)
         except NotFiniteError as error:
             content["problem"] = str(error)
-    run.folder.mkdir(parents=True, exist_ok=True)
-    write_atomic(run.folder / "scores.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
+    write_scores(run, content)
     return content
 
 
@@ -109,9 +105,10 @@ def _score_sources(
 
 
 def _fingerprint(shards: ShardFolder, count: int) -> str:
-    """Tell one set of graphs from another, wherever the folder lies."""
+    """Tell one set of graphs from another by content, wherever the folder lies."""
+    tars = [f"{entry.name} {entry.sha256}" for entry in shards.shards]
     keys = [shards.key(index).partition("/")[2] for index in range(count)]
-    return hashlib.sha256("\n".join(keys).encode()).hexdigest()
+    return hashlib.sha256("\n".join([*tars, *keys]).encode()).hexdigest()
 
 
 def _is_finite(model: Light3R) -> bool:

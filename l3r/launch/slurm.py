@@ -32,7 +32,9 @@ def submit_sweep(sweep: Sweep, states: Mapping[str, RunState]) -> str:
         if states[run.name].kind in ("new", "begun", "trained", "failed")
     ]
     if not left:
-        return "nothing to submit: no run is left to do"
+        waiting = [state.describe() for state in states.values() if state.kind == "waiting"]
+        why = f"{len(waiting)} runs are {waiting[0]}" if waiting else "no run is left to do"
+        return f"nothing to submit: {why}"
     if not SCRIPT.is_file():
         raise LaunchError(f"{SCRIPT}: no such file; run this in the folder of the project")
     array = ",".join(map(str, left))

@@ -51,7 +51,7 @@ class SweepConfig:
     output_dir: str = ""
     """Where ``ROW/seed_S`` go; empty: ``runs/sweep/NAME``, NAME being the sweep file's."""
     equal_images: bool = True
-    """Refuse rows whose images a step differ by more than whole graphs make them."""
+    """Refuse rows that differ in steps, or in images a step by more than whole graphs make them."""
 
     def __post_init__(self) -> None:
         """Check names, and make a list of every row."""

@@ -39,6 +39,8 @@ def read_sweep(folder: Path) -> Sweep:
     path = folder / NAME
     try:
         plain = json.loads(path.read_text())
+        if plain["version"] != _VERSION:
+            raise ValueError(f"version {plain['version']}, expected {_VERSION}")
         spec = {**plain["spec"], "evaluate": EvaluateConfig(**plain["spec"]["evaluate"])}
         return Sweep(
             file=Path(plain["file"]),

@@ -39,9 +39,9 @@ def run_share(
         launcher: Words before ``l3r train``.
 
     Returns:
-        The table, and the names of runs that failed.
+        The table, and the names of runs that are not over.
     """
     runner = SweepRunner(sweep, jobs=jobs, launcher=launcher)
     write_sweep(sweep)
-    failed = runner.run(share)
-    return report_sweep(sweep.out), failed
+    left = runner.run(share)
+    return report_sweep(sweep.out), left

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 from l3r.launch.expand import expand
-from l3r.launch.run_state import scoring_request
+from l3r.launch.score_file import scoring_request
 from tests.launch.sweeps import note_bad_steps, score_by_hand, train_by_hand
 
 

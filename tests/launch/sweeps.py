@@ -5,6 +5,7 @@ import json
 import yaml
 
 from l3r.config import to_yaml
+from l3r.launch.score_file import describe_scored, write_scores
 from l3r.version import __version__
 
 BASE = ["data.sources.hand.shards=shards", "data.validation.hand.shards=shards"]
@@ -40,18 +41,19 @@ def train_by_hand(run, *, steps=None, rate=16.0, machine="CPU", done=True):
         (run.folder / "model.ckpt").write_bytes(b"weights")
 
 
-def score_by_hand(run, request, *, problem="", graphs="a" * 64, **network):
+def score_by_hand(run, request, *, problem="", graphs="a" * 64, max_steps=None, **network):
     """Leave what scoring leaves."""
     source = {"num_graphs": 20, "num_views": request["num_views"], "graphs_sha256": graphs}
+    if max_steps is None:
+        max_steps = run.config.train.max_steps if run.config else 0
     content = {
-        "request": {**request, "settings": [] if run.config else list(run.layers)},
+        **describe_scored(run, request, max_steps),
         "problem": problem,
         "network": None if problem else {**NETWORK, **network},
         "identity": None if problem else IDENTITY,
         "sources": {} if problem else {"hand": source},
     }
-    run.folder.mkdir(parents=True, exist_ok=True)
-    (run.folder / "scores.json").write_text(json.dumps(content))
+    write_scores(run, content)
 
 
 def note_bad_steps(run, steps, **more):

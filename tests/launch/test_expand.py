@@ -120,6 +120,12 @@ def test_a_sweep_is_read_back_from_its_folder_wherever_that_is(tmp_path):
         ({"checkpoint": "a.ckpt"}, r"checkpoint is a\.ckpt, expected a path with \{seed\}"),
         ({"checkpoint": "{seed}", "base": [], "rows": {"a": "train.lr=1"}}, "graph or inference"),
         ({"rows": {"a": "data.num_views=4", "b": []}}, r"images a step .*\(a: 32, b: 64\)"),
+        (
+            {"rows": {"a": "train.max_steps=9", "b": []}},
+            r"max_steps differs .*\(a: 9, b: 100,000\)",
+        ),
+        ({"rows": {"a": "data.validation.hand.span=[0.5,1]"}}, "a sets data.validation.hand.span"),
+        ({"base": BASE[:1]}, r"nothing to score on; add data\.validation"),
     ],
 )
 def test_a_bad_sweep_gets_one_line_that_says_what_to_do(tmp_path, content, message, capsys):
@@ -201,10 +207,22 @@ def ten_views(tmp_path_factory):
     return write_folder(tmp_path_factory.mktemp("ten"), graphs)
 
 
+@pytest.fixture(scope="module")
+def more_views(tmp_path_factory):
+    graphs = [make_graph(100 + n, num_views=10, height=16, width=16) for n in range(7)]
+    return write_folder(tmp_path_factory.mktemp("more"), graphs)
+
+
+def reading(**places):
+    parts = ("sources", "validation")
+    return [
+        f"data.{part}.{name}.shards={place}" for part in parts for name, place in places.items()
+    ]
+
+
 def test_runs_of_one_seed_see_the_same_graphs_in_the_same_slots(ten_views, tmp_path):
     rows = {"L2": "model.alignment.num_blocks=2", "global": "loss.global_weight=1", "plain": []}
-    base = [f"data.sources.hand.shards={ten_views}"]
-    sweep = expand(write_sweep_file(tmp_path, base=base, rows=rows))
+    sweep = expand(write_sweep_file(tmp_path, base=reading(hand=ten_views), rows=rows))
     plans = {run.name: described(run) for run in sweep.runs}
     for seed in (0, 1):
         own = [plans[f"{row}/seed_{seed}"] for row in rows]
@@ -212,16 +230,20 @@ def test_runs_of_one_seed_see_the_same_graphs_in_the_same_slots(ten_views, tmp_p
     assert plans["plain/seed_0"] != plans["plain/seed_1"]
 
 
-def test_rows_of_another_graph_size_see_as_many_images_of_the_same_graphs(ten_views, tmp_path):
+def test_rows_of_another_graph_size_see_as_many_images_of_the_same_graphs(
+    ten_views, more_views, tmp_path
+):
     rows = {"3": ["data.num_views=3", "data.graphs_per_step=5"], "8": "data.graphs_per_step=2"}
     rows["5"] = ["data.num_views=5", "data.graphs_per_step=3"]
-    base = [f"data.sources.hand.shards={ten_views}"]
-    sweep = expand(write_sweep_file(tmp_path, base=base, rows=rows, seeds=[0]))
-    keys = {}
-    for run in sweep.runs:
-        slots = [slot for plan in described(run) for slot in plan.slots]
-        assert len(slots) * run.config.data.num_views == pytest.approx(30 * 16, rel=0.1)
-        keys[run.row] = [slot.key for slot in slots]
-    # The graphs come in one order; a row of larger graphs stops earlier in it.
-    assert keys["5"] == keys["3"][: len(keys["5"])]
-    assert keys["8"] == keys["5"][: len(keys["8"])]
+    for sources in ({"hand": ten_views}, {"hand": ten_views, "more": more_views}):
+        base = reading(**sources)
+        sweep = expand(write_sweep_file(tmp_path, base=base, rows=rows, seeds=[0]))
+        keys = {}
+        for run in sweep.runs:
+            slots = [slot for plan in described(run) for slot in plan.slots]
+            assert len(slots) * run.config.data.num_views == pytest.approx(30 * 16, rel=0.1)
+            keys[run.row] = [(slot.source, slot.key) for slot in slots]
+            assert len({source for source, _ in keys[run.row]}) == len(sources)
+        # The graphs come in one order; a row of larger graphs stops earlier in it.
+        assert keys["5"] == keys["3"][: len(keys["5"])]
+        assert keys["8"] == keys["5"][: len(keys["8"])]

@@ -1,11 +1,13 @@
 import os
 
 import pytest
+import torch
 
 from l3r.errors import ConfigError
 from l3r.launch.expand import expand
-from l3r.launch.run_state import FAILURE, read_state, read_states, scoring_request
+from l3r.launch.run_state import FAILURE, read_state, read_states
 from l3r.launch.run_table import StepCost, estimate_steps, format_runs
+from l3r.launch.score_file import digest_checkpoint, scoring_request
 from tests.launch.sweeps import note_bad_steps, score_by_hand, train_by_hand, write_sweep_file
 
 
@@ -26,17 +28,41 @@ def test_a_run_goes_from_new_over_begun_and_trained_to_scored(sweep, state):
     assert state().kind == "scored"
 
 
-def test_scores_of_other_graphs_or_older_weights_do_not_count(sweep, state):
+def test_scores_of_other_graphs_or_other_weights_do_not_count(sweep, state):
     run, request = sweep.runs[0], scoring_request(sweep)
     train_by_hand(run)
     score_by_hand(run, {**request, "num_views": 5})
     assert state().kind == "trained"
+    score_by_hand(run, {**request, "sources": {"hand": ["elsewhere", 0.0, 1.0]}})
+    assert state().kind == "trained"
     score_by_hand(run, request)
-    later = (run.folder / "scores.json").stat().st_mtime + 10
-    os.utime(run.checkpoint, (later, later))
+    assert state().kind == "scored"
+    # Copied scores are new files, of old weights.
+    before = (run.folder / "scores.json").stat().st_mtime
+    run.checkpoint.write_bytes(b"other weights")
+    os.utime(run.checkpoint, (before - 10, before - 10))
     assert state().kind == "trained"
     (run.folder / "scores.json").write_text("{")
     assert state().kind == "trained"
+
+
+def test_a_sweep_that_was_copied_without_its_times_is_as_it_was(sweep, state):
+    run = sweep.runs[0]
+    train_by_hand(run)
+    score_by_hand(run, scoring_request(sweep))
+    (run.folder / "last.ckpt").write_bytes(b"all")
+    written = run.checkpoint.stat().st_mtime
+    os.utime(run.folder / "last.ckpt", (written + 5, written + 5))
+    os.utime(run.folder / "scores.json", (written - 5, written - 5))
+    assert state().kind == "scored"
+
+
+def test_checkpoints_are_told_apart_by_their_weights_and_not_by_their_names(tmp_path):
+    def digest(name, value):
+        torch.save({"weight": torch.full((1000,), value), "step": 1}, tmp_path / name)
+        return digest_checkpoint(tmp_path / name)
+
+    assert digest("a.ckpt", 1.0) == digest("b.ckpt", 1.0) != digest("c.ckpt", 2.0)
 
 
 def test_scores_outlive_the_checkpoint_and_a_training_that_was_cut_short_does_not(sweep, state):
@@ -49,16 +75,39 @@ def test_scores_outlive_the_checkpoint_and_a_training_that_was_cut_short_does_no
     assert state().kind == "begun"
 
 
-def test_a_longer_training_that_was_killed_before_it_wrote_its_weights_is_not_scored(sweep, state):
+@pytest.mark.parametrize("has_weights", [True, False])
+def test_a_longer_training_that_was_killed_before_it_wrote_its_weights_is_not_scored(
+    sweep, has_weights
+):
     run = sweep.runs[0]
     train_by_hand(run)
+    score_by_hand(run, scoring_request(sweep))
+    longer = expand(sweep.file, ["train.max_steps=200000"])
+    train_by_hand(longer.runs[0], steps=200_000)
     (run.folder / "last.ckpt").write_bytes(b"all")
-    later = run.checkpoint.stat().st_mtime
-    os.utime(run.folder / "last.ckpt", (later - 5, later - 5))
+    later = run.checkpoint.stat().st_mtime + 5
+    os.utime(run.folder / "last.ckpt", (later, later))
+    if not has_weights:
+        run.checkpoint.unlink()
+    state = read_states(longer)[run.name]
+    assert state.describe() == "goes on, reached step 200,000 of 200,000"
+
+
+def test_a_folder_whose_configuration_cannot_be_read_is_refused(sweep):
+    train_by_hand(sweep.runs[0])
+    config = sweep.runs[0].folder / "config.yaml"
+    config.write_text(config.read_text().replace("weight_decay", "weight_decoy"))
+    with pytest.raises(ConfigError, match=r"config\.yaml: .*weight_decoy.*give --out"):
+        read_states(sweep)
+
+
+def test_what_is_validated_on_may_change_and_is_scored_anew(sweep, state):
+    run = sweep.runs[0]
+    train_by_hand(run)
     score_by_hand(run, scoring_request(sweep))
     assert state().kind == "scored"
-    os.utime(run.folder / "last.ckpt", (later + 5, later + 5))
-    assert state().describe() == "goes on, reached step 100,000 of 100,000"
+    other = expand(sweep.file, ["data.validation.own.shards=own", "data.validation.own.span=[0,1]"])
+    assert read_states(other)[run.name].kind == "trained"
 
 
 def test_a_finished_run_with_another_start_is_not_taken_for_this_one(tmp_path):
@@ -130,6 +179,14 @@ def test_a_sweep_over_checkpoints_waits_for_them_and_scores_each_row_anew(tmp_pa
     (tmp_path / "seed_0.ckpt").rename(tmp_path / "kept")
     assert read_states(sweep)["mst/seed_0"].kind == "scored", "as seen from another folder"
     (tmp_path / "kept").rename(tmp_path / "seed_0.ckpt")
+    # The same row of other checkpoints is another one, whatever their age.
+    (tmp_path / "other_0.ckpt").write_bytes(b"other weights")
+    os.utime(tmp_path / "other_0.ckpt", (0, 0))
+    place = str(tmp_path / "other_{seed}.ckpt")
+    path = write_sweep_file(tmp_path, base=[], rows=rows, checkpoint=place)
+    assert read_states(expand(path))["mst/seed_0"].kind == "trained"
+    (tmp_path / "other_0.ckpt").unlink()
+    assert read_states(expand(path))["mst/seed_0"].kind == "waiting"
     other = {**rows, "mst": ["graph.algorithm=mst", "graph.knn=3"]}
     path = write_sweep_file(tmp_path, base=[], rows=other, checkpoint=str(checkpoint))
     assert read_states(expand(path))["mst/seed_0"].kind == "trained"

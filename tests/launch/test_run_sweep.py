@@ -13,8 +13,9 @@ from l3r.errors import LaunchError
 from l3r.launch import run_sweep
 from l3r.launch.expand import expand
 from l3r.launch.run_lock import RunLock
-from l3r.launch.run_state import read_states
+from l3r.launch.run_state import read_state, read_states
 from l3r.launch.run_sweep import SweepRunner
+from l3r.launch.score_file import scoring_request
 from l3r.launch.sweep_report import report_sweep
 from tests.data.graphs import make_graph, write_folder
 from tests.launch.sweeps import train_by_hand, write_sweep_file
@@ -51,6 +52,34 @@ def test_every_run_is_trained_and_scored_and_none_is_done_again(two, capsys):
     assert SweepRunner(two).run(two.runs) == []
     assert len(calls(two)) == 8
     assert "4/4" in capsys.readouterr().err
+
+
+def test_a_failure_is_explained_by_its_own_process(tmp_path):
+    log = tmp_path / "log.txt"
+    log.write_text("$ l3r train a\nl3r train: no room\n$ l3r train a\n")
+    assert run_sweep.explain_exit(-9, log) == "killed by signal 9"
+    log.write_text(log.read_text() + "l3r train: no weights\nbye\n")
+    assert run_sweep.explain_exit(2, log) == "exit code 2: l3r train: no weights"
+
+
+def test_a_folder_that_turns_out_to_be_another_run_fails_alone(two):
+    SweepRunner(two).run(two.runs[:1])
+    config = two.runs[0].folder / "config.yaml"
+    config.write_text(config.read_text().replace("seed: 0", "seed: 7"))
+    assert SweepRunner(two).run(two.runs[:2]) == ["none/seed_0"]
+    assert read_state(two.runs[1], scoring_request(two)).kind == "scored"
+
+
+def test_what_waits_for_a_checkpoint_is_not_done(tmp_path, capsys):
+    place = str(tmp_path / "{seed}.ckpt")
+    file = write_sweep_file(tmp_path, base=[], rows={"spt": []}, seeds=[0, 1], checkpoint=place)
+    assert main(["sweep", str(file)]) == 1
+    assert f"waiting: no {tmp_path}/0.ckpt yet" in capsys.readouterr().err
+    assert main(["sweep", str(file), "--submit"]) == 0
+    said = capsys.readouterr().out
+    assert f"nothing to submit: 2 runs are waiting: no {tmp_path}/0.ckpt yet" in said
+    assert main(["sweep", str(file), "--tasks", "0"]) == 2
+    assert "--tasks is 0, expected 1 or more" in capsys.readouterr().err
 
 
 def test_what_is_trained_is_only_scored(two):

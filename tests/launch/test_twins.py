@@ -6,9 +6,10 @@ import pytest
 from l3r.launch import run_sweep
 from l3r.launch.expand import expand
 from l3r.launch.results import collect_results
-from l3r.launch.run_state import read_states, scoring_request
+from l3r.launch.run_state import read_states
 from l3r.launch.run_sweep import SweepRunner
 from l3r.launch.run_table import format_runs
+from l3r.launch.score_file import scoring_request
 from l3r.launch.sweep_markdown import render_markdown
 from tests.launch.sweeps import score_by_hand, train_by_hand, write_sweep_file
 
@@ -36,7 +37,7 @@ def second(tmp_path, monkeypatch, extra=(), **content):
     rows = {"0.1": [], "1": "loss.global_weight=1"}
     content = {"rows": rows, "seeds": [0], "output_dir": str(tmp_path / "weight"), **content}
     sweep = expand(write_sweep_file(tmp_path, "weight.yaml", **content), extra)
-    sweep.out.mkdir()
+    sweep.out.mkdir(exist_ok=True)
     words = ("-m", "tests.launch.stub", str(sweep.file), str(sweep.out), " ".join(extra))
     monkeypatch.setattr(run_sweep, "_L3R", (sys.executable, *words))
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
@@ -57,13 +58,28 @@ def test_a_training_that_a_neighbouring_sweep_has_done_is_taken_from_there(
     assert (sweep.out / "calls.txt").read_text() == "train 1/seed_0\nsweep 1/seed_0\n"
     assert states["0.1/seed_0"].scores == read_states(first)["4/seed_0"].scores
     text = render_markdown(collect_results(sweep, states))
-    assert "Row 0.1 was trained as layers/4, with the same configuration and seeds." in text
+    assert "Row 0.1, seed 0: trained as layers/4, with the same configuration." in text
     own, other = sweep.runs[0].checkpoint, first.runs[0].checkpoint
     assert own.samefile(other)
     # What is taken stays, whatever becomes of where it was.
     (first.runs[0].folder / "config.yaml").unlink()
     other.unlink()
     assert read_states(sweep)["0.1/seed_0"].describe() == "scored, of layers/4"
+
+
+def test_scores_of_other_weights_than_the_twin_has_now_are_not_taken(first, tmp_path, monkeypatch):
+    first.runs[0].checkpoint.write_bytes(b"weights of more steps")
+    sweep = second(tmp_path, monkeypatch)
+    SweepRunner(sweep).run(sweep.runs[:1])
+    assert (sweep.out / "calls.txt").read_text() == "sweep 0.1/seed_0\n"
+
+
+def test_what_goes_on_is_no_longer_what_it_was_taken_from(first, tmp_path, monkeypatch):
+    sweep = second(tmp_path, monkeypatch)
+    SweepRunner(sweep).run(sweep.runs[:1])
+    longer = second(tmp_path, monkeypatch, ["train.max_steps=200000"])
+    SweepRunner(longer).run(longer.runs[:1])
+    assert read_states(longer)["0.1/seed_0"].describe() == "scored"
 
 
 def test_what_is_taken_is_scored_on_the_graphs_of_its_own_sweep(first, tmp_path, monkeypatch):

@@ -12,7 +12,8 @@ from l3r.errors import LaunchError
 from l3r.launch.expand import expand
 from l3r.launch.measure import main as measure
 from l3r.launch.measure import measure_rows
-from l3r.launch.run_state import read_states, scoring_request
+from l3r.launch.run_state import read_states
+from l3r.launch.score_file import scoring_request
 from l3r.launch.slurm import job_is_leaving, submit_sweep
 from tests.launch.sweeps import score_by_hand, train_by_hand, write_sweep_file
 from tests.slurm.cluster import ROOT
