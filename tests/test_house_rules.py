@@ -144,6 +144,7 @@ def test_the_wheel_holds_every_package_and_imports(tmp_path):
     assert {"l3r/py.typed", "data_prep/py.typed", "l3r/export/report.html"} <= held
     assert {"data_prep/pages/check.html", "data_prep/pages/base.html"} <= held
     assert {"l3r/export/chart.html", "l3r/launch/sweep_report.html"} <= held
+    assert "l3r/launch/score_chart.html" in held
     code = "import l3r.cli.main, data_prep.cli; print(l3r.__file__)"
     done = subprocess.run(
         [sys.executable, "-c", code],

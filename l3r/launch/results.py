@@ -21,15 +21,27 @@ METRICS = {
 LOWER_IS_BETTER = ("ate",)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Spread:
     """A score over seeds."""
 
-    mean: float
-    deviation: float | None
-    """Sample standard deviation (n - 1); None of a single seed."""
-    count: int
-    """Seeds that it is of."""
+    values: tuple[float, ...]
+    """One of each seed that has it, at least one."""
+
+    @property
+    def mean(self) -> float:
+        """Of the values."""
+        return fmean(self.values)
+
+    @property
+    def deviation(self) -> float | None:
+        """Sample standard deviation (n - 1); None of a single seed."""
+        return stdev(self.values) if len(self.values) > 1 else None
+
+    @property
+    def count(self) -> int:
+        """Seeds that it is of."""
+        return len(self.values)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,12 +107,6 @@ def collect_results(sweep: Sweep, states: Mapping[str, RunState]) -> SweepResult
     )
 
 
-def spread_of(values: Sequence[float]) -> Spread:
-    """Take mean and sample standard deviation of one value or more."""
-    deviation = stdev(values) if len(values) > 1 else None
-    return Spread(mean=fmean(values), deviation=deviation, count=len(values))
-
-
 def best_rows(result: SweepResult, metric: str) -> set[str]:
     """Name the rows with the best mean as it is printed, of those where every seed has scores."""
     means = {
@@ -160,7 +166,7 @@ def _collect_row(
         label=paper.labels.get(row, row) if paper else row,
         changes=sweep.changes.get(row, {}),
         kinds=[state.kind for state in own],
-        scores={metric: spread_of(found) for metric, found in values.items() if found},
+        scores={metric: Spread(tuple(found)) for metric, found in values.items() if found},
         step_seconds=median(seconds) if seconds else None,
         gpu_gib=max(memory, default=None),
         hours=median(seconds) * steps / 3600 if seconds and steps else None,

@@ -23,6 +23,7 @@ from l3r.launch.results import (
     format_score,
 )
 from l3r.launch.run_state import RunState, read_states
+from l3r.launch.score_chart import draw_scores
 from l3r.launch.sweep_file import read_sweep
 from l3r.launch.sweep_markdown import cost_table, describe_kinds, format_spread, render_markdown
 from l3r.version import __version__
@@ -68,13 +69,16 @@ def render_sweep_page(sweep: Sweep, result: SweepResult, states: Mapping[str, Ru
         lstrip_blocks=True,
     )
     headers, cost = cost_table(result)
+    charts = [chart for chart in draw_curves(sweep, result, states) if chart]
+    colors = {line.name: line.color for line in charts[0].lines} if charts else {}
     return environment.get_template("sweep_report.html").render(
         version=__version__,
         result=result,
         columns=[(name, "↓" if key in LOWER_IS_BETTER else "↑") for key, name in METRICS.items()],
         num_paper=len(PAPER_METRICS) if result.paper else 0,
         rows=[_page_row(result, row) for row in result.rows],
-        charts=[chart for chart in draw_curves(sweep, result, states) if chart],
+        scores=draw_scores(result, colors),
+        charts=charts,
         cost_headers=headers,
         cost=[[cell.replace("`", "") for cell in row] for row in cost],
         runs=[(name, state.describe()) for name, state in states.items()],

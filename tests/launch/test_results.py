@@ -13,8 +13,9 @@ from l3r.cli.main import main
 from l3r.errors import DataError
 from l3r.launch.expand import expand
 from l3r.launch.paper_tables import METRICS, PAPER_TABLES
-from l3r.launch.results import best_of_paper, best_rows, collect_results, spread_of
+from l3r.launch.results import Spread, best_of_paper, best_rows, collect_results
 from l3r.launch.run_state import FAILURE, read_states
+from l3r.launch.score_chart import LEFT, RIGHT, draw_scores
 from l3r.launch.score_file import scoring_request
 from l3r.launch.sweep_file import write_sweep
 from l3r.launch.sweep_markdown import format_spread, render_markdown
@@ -26,7 +27,7 @@ GOLDEN = Path(__file__).parents[1] / "golden" / "sweep_table.md"
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=9))
 def test_a_spread_is_mean_and_sample_deviation(values):
-    spread = spread_of(values)
+    spread = Spread(tuple(values))
     assert spread.mean == pytest.approx(fmean(values))
     assert spread.count == len(values)
     assert spread.deviation == (pytest.approx(stdev(values)) if len(values) > 1 else None)
@@ -65,7 +66,7 @@ def test_a_run_that_diverged_or_failed_is_shown_and_never_averaged_away(done):
     note_bad_steps(done.runs[2], [30, 31, 32])
     result = collect_results(done, read_states(done))
     row, other = result.rows[:2]
-    assert row.scores["rra_5"] == spread_of([40.0, 44.0])
+    assert row.scores["rra_5"] == Spread((40.0, 44.0))
     text = render_markdown(result)
     assert "42.0 ± 2.8 (n = 2)" in text
     assert "2 of 3, diverged 1 of 3" in text
@@ -157,8 +158,8 @@ def test_a_diverged_run_has_a_curve_of_its_own_and_cuts_no_other_short(done):
 
 
 def test_one_seed_has_no_deviation_and_missing_values_are_a_dash():
-    assert format_spread(spread_of([41.23]), "rra_5", 1) == "41.2 (n = 1)"
-    assert format_spread(spread_of([0.1, 0.2]), "ate", 2) == "0.150 ± 0.071"
+    assert format_spread(Spread((41.23,)), "rra_5", 1) == "41.2 (n = 1)"
+    assert format_spread(Spread((0.1, 0.2)), "ate", 2) == "0.150 ± 0.071"
     assert format_spread(None, "ate", 2) == "-"
 
 
@@ -188,7 +189,7 @@ def test_a_row_with_a_score_of_some_seeds_alone_is_not_the_best(done):
         is_lucky = run.row == "0.1" or run.seed == 0
         score_by_hand(run, request, ate=(0.05 if run.row == "0.1" else 0.01) if is_lucky else None)
     result = collect_results(done, read_states(done))
-    assert result.rows[0].scores["ate"] == spread_of([0.01])
+    assert result.rows[0].scores["ate"] == Spread((0.01,))
     assert best_rows(result, "ate") == set()
 
 
@@ -229,6 +230,29 @@ def test_the_report_of_a_sweep_needs_no_torch(done):
     root = Path(__file__).parents[2]
     finished = subprocess.run(command, capture_output=True, text=True, cwd=root)
     assert finished.returncode == 0, finished.stderr
+
+
+def test_every_seed_is_a_dot_in_the_colour_of_its_row(done):
+    score_by_hand(done.runs[0], scoring_request(done), rra_5=47.0)
+    result = collect_results(done, read_states(done))
+    charts = draw_scores(result, {"0.1": "red"})
+    chart = charts[0]
+    assert [line.label for line in chart.lines] == ["0.01", "0.1"]
+    assert [line.color == "red" for line in chart.lines] == [False, True]
+    for line in chart.lines:
+        assert len(line.dots) == 3
+        assert LEFT < line.reach[0] < line.mean < line.reach[1] < RIGHT
+        assert LEFT < min(line.dots) <= line.mean <= max(line.dots) < RIGHT
+    # By the same ruler: 47 less 41 is six times 42 less 41.
+    first, second = chart.lines
+    assert first.dots[0] - second.dots[0] == pytest.approx(
+        6 * (first.dots[1] - second.dots[0]), abs=0.5
+    )
+    assert "lower is better" in charts[2].title
+    page = render_sweep_page(done, result, read_states(done))
+    assert page.count("<circle") >= 3 * 2 * len(charts)
+    alone = expand(write_sweep_file(done.out.parent, "one.yaml", rows={"one": []}, seeds=[0]))
+    assert draw_scores(collect_results(alone, read_states(alone)), {}) == []
 
 
 def test_a_damaged_description_is_refused(done):
