@@ -17,7 +17,7 @@ $(STAMP): pyproject.toml constraints.txt
 demo: install
 	PATH="$(CURDIR)/$(BIN):$$PATH" bash demo/run.sh
 
-# The paper's ablations on synthetic rooms; an hour or two on two cores, and resumable.
+# The paper's ablations on synthetic rooms; two hours on two cores, and resumable.
 sweep-tiny: install
 	PATH="$(CURDIR)/$(BIN):$$PATH" bash demo/sweeps.sh
 

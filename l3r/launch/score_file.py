@@ -63,12 +63,11 @@ def read_scores(run: Run, request: Mapping[str, Any]) -> dict[str, Any] | None:
         **request,
         "settings": _settings_of(run),
     }
-    is_trained = run.config is not None
     if run.config is not None:
         is_wanted &= scores.get("max_steps") == run.config.train.max_steps
     if run.checkpoint.is_file():
         is_wanted &= scores.get("weights") == digest_checkpoint(run.checkpoint)
-    elif not is_trained:
+    elif run.config is None:
         is_wanted &= scores.get("checkpoint") == str(run.checkpoint)
     return scores if is_wanted else None
 
