@@ -27,6 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--list", action="store_true", help="print the runs and what they cost; run nothing")
     add("--measure", action="store_true", help="first rehearse rows of which no step is measured")
     add("--submit", action="store_true", help="submit an array of SLURM jobs for what is left")
+    add("--sbatch", default="", metavar="WORDS", help="for --submit: --sbatch='--mem=64G'")
     add("--jobs", type=int, default=1, metavar="K", help="runs at a time (1)")
     add("--tasks", type=int, default=1, metavar="K", help="tasks that share the runs (1)")
     add("--task-index", type=int, default=0, metavar="I", help="which of them this is, from 0")
@@ -48,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     if args.list:
         return 0
     if args.submit:
-        sys.stdout.write(sweep_job.submit(sweep))
+        sys.stdout.write(sweep_job.submit(sweep, shlex.split(args.sbatch)))
         return 0
     share = sweep.share(args.task_index, args.tasks)
     launcher = shlex.split(args.launcher)

@@ -2,7 +2,7 @@
 
 import os
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from l3r.errors import LaunchError
@@ -13,12 +13,13 @@ from l3r.train.signals import name_job
 SCRIPT = Path("slurm/sweep.sh")
 
 
-def submit_sweep(sweep: Sweep, states: Mapping[str, RunState]) -> str:
+def submit_sweep(sweep: Sweep, states: Mapping[str, RunState], options: Sequence[str] = ()) -> str:
     """Submit an array with a task for each run that is not over.
 
     Args:
         sweep: The sweep.
         states: Of its runs, by name.
+        options: Of ``sbatch``, in place of those in the script.
 
     Returns:
         What ``sbatch`` said, or that there is nothing to do.
@@ -39,7 +40,7 @@ def submit_sweep(sweep: Sweep, states: Mapping[str, RunState]) -> str:
         raise LaunchError(f"{SCRIPT}: no such file; run this in the folder of the project")
     array = ",".join(map(str, left))
     sweep_words = (str(sweep.file), *sweep.extra, "--out", str(sweep.out))
-    command = ["sbatch", f"--array={array}", str(SCRIPT), *sweep_words]
+    command = ["sbatch", f"--array={array}", *options, str(SCRIPT), *sweep_words]
     try:
         done = subprocess.run(
             [*command, "--tasks", str(len(sweep.runs))], capture_output=True, text=True

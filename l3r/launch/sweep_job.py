@@ -20,10 +20,15 @@ def list_runs(sweep: Sweep, *, measure: bool) -> str:
     return format_runs(sweep, states, measure_rows(sweep, states) if measure else None)
 
 
-def submit(sweep: Sweep) -> str:
-    """Submit what is left as an array of SLURM jobs, and give what to do next."""
+def submit(sweep: Sweep, options: Sequence[str]) -> str:
+    """Submit what is left as an array of SLURM jobs, and give what to do next.
+
+    Args:
+        sweep: The sweep.
+        options: Of ``sbatch``, in place of those in the script.
+    """
     write_sweep(sweep)
-    said = submit_sweep(sweep, read_states(sweep))
+    said = submit_sweep(sweep, read_states(sweep), options)
     return f"{said}\nthe tables, now and later: l3r report {sweep.out}\n"
 
 

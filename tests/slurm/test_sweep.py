@@ -2,6 +2,8 @@
 
 import csv
 import os
+import re
+import sys
 import time
 from pathlib import Path
 
@@ -88,3 +90,20 @@ def test_an_array_does_a_sweep_whatever_becomes_of_its_tasks(cluster, sweep_file
             steps = [int(row["step"]) for row in csv.DictReader(stream)]
         assert steps == list(range(1, STEPS + 1)), "gone on, not begun anew"
         assert (run.folder / "log.txt").read_text().count(" train ") >= 2
+
+
+def test_what_is_left_is_submitted_with_options_of_sbatch(cluster, sweep_file, tmp_path):
+    words = [f"--{key.replace('_', '-')}={value}" for key, value in TASK.items()]
+    words += [f"--output={tmp_path}/%A_%a.log"]
+    said = cluster.run(
+        *(sys.executable, "-m", "l3r", "sweep", str(sweep_file), "train.max_steps=20"),
+        *("--submit", f"--sbatch={' '.join(words)}"),
+        **{"cwd": ROOT, "env": {"MASTER_ADDR": "127.0.0.1"}},
+    )
+    assert "4 tasks, a run each" in said
+    job = re.search(r"batch job (\d+)", said)[1]
+    for task in range(4):
+        cluster.wait(f"{job}_{task}", timeout=180)
+    sweep = expand(sweep_file, ["train.max_steps=20"])
+    assert {state.kind for state in read_states(sweep).values()} == {"scored"}
+    assert (sweep.out / "table.md").read_text().count("2 of 2") == 2
